@@ -1,0 +1,64 @@
+"""Differentiable statics of soft manipulators: Cosserat rods bent by tendons and fluidic chambers."""
+
+from typing import TYPE_CHECKING, Any
+
+from . import se3 as se3
+from .actuator import Chamber as Chamber, Tendon as Tendon, Thread as Thread
+from .basis import (
+    Basis as Basis,
+    FunctionBasis as FunctionBasis,
+    Functions as Functions,
+    Legendre as Legendre,
+    Monomial as Monomial,
+    PiecewiseConstant as PiecewiseConstant,
+    Trigonometric as Trigonometric,
+)
+from .discrete import (
+    Prescribed as Prescribed,
+    actuation_matrix as actuation_matrix,
+    jacobian as jacobian,
+    stiffness_matrix as stiffness_matrix,
+)
+from .equilibrium import Equilibrium as Equilibrium
+from .kinematics import step_twist as step_twist, zanna_step as zanna_step
+from .model import Status as Status
+from .profile import (
+    Constant as Constant,
+    FunctionProfile as FunctionProfile,
+    PolynomialProfile as PolynomialProfile,
+    SplineProfile as SplineProfile,
+    Taper as Taper,
+)
+from .rod import Rod as Rod
+from .routing import (
+    Function as Function,
+    Helix as Helix,
+    Linear as Linear,
+    Parallel as Parallel,
+    Polynomial as Polynomial,
+    Spline as Spline,
+)
+from .scene import Scene as Scene
+from .section import (
+    Annular as Annular,
+    Circular as Circular,
+    Elliptic as Elliptic,
+    Material as Material,
+    Rectangular as Rectangular,
+)
+from .solve import SolveError as SolveError, solve as solve
+from .strain_dependent import StrainDependent as StrainDependent
+
+if TYPE_CHECKING:
+    from .continuum import Continuum as Continuum
+
+__version__ = "0.1.0"
+
+
+def __getattr__(name: str) -> Any:
+    # diffrax takes a third of the import time and only `Continuum` needs it.
+    if name == "Continuum":
+        from .continuum import Continuum
+
+        return Continuum
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,68 @@
+"""Checks of what a user hands over: every refusal is a `ValueError` that names the argument, what came and what is needed."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array
+
+
+def is_traced(value: Any) -> bool:
+    """Whether only the shape of `value` is known, as under `jax.jit`."""
+    return isinstance(value, Tracer)
+
+
+def concrete(value: Any) -> np.ndarray | None:
+    """`value` as a NumPy array, or None while it is traced (then only its shape is known)."""
+    return None if is_traced(value) else np.asarray(value)
+
+
+def _refuse(name: str, value: Any, needed: str) -> ValueError:
+    return ValueError(f"{name}: got {value!r}, need {needed}")
+
+
+def numbers(name: str, value: Any, shape: tuple[int, ...] | None = (), *, positive: bool = False, nonnegative: bool = False) -> Array:
+    """`value` as a floating-point array of `shape` (any shape for None), finite and of the wanted sign where it is known."""
+    kind = "a number" if shape == () else "numbers" if shape is None else f"numbers of shape {shape}"
+    needed = kind if not (positive or nonnegative) else f"{kind} {'> 0' if positive else '>= 0'}"
+    if isinstance(value, str):
+        raise _refuse(name, value, needed)
+    try:
+        array = jnp.asarray(value)
+    except (TypeError, ValueError):
+        raise _refuse(name, value, needed) from None
+    if jnp.issubdtype(array.dtype, jnp.complexfloating) or array.dtype == bool:
+        raise _refuse(name, value, f"real {needed}")
+    array = array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(float)
+    if shape is not None and array.shape != shape:
+        raise ValueError(f"{name}: got shape {array.shape}, need {needed}")
+    known = concrete(array)
+    if known is not None:
+        if not np.all(np.isfinite(known)):
+            raise _refuse(name, value, f"finite {needed}")
+        if (positive and not np.all(known > 0)) or (nonnegative and not np.all(known >= 0)):
+            raise _refuse(name, value, needed)
+    return array
+
+
+def count(name: str, value: Any, *, least: int = 1) -> int:
+    """`value` as an integer of at least `least`."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise _refuse(name, value, f"an integer >= {least}")
+    return int(value)
+
+
+def choice(name: str, value: Any, allowed: Sequence[Any]) -> Any:
+    """`value` if it is one of `allowed`."""
+    if value not in allowed:
+        raise _refuse(name, value, "one of " + ", ".join(repr(a) for a in allowed))
+    return value
+
+
+def instance(name: str, value: Any, kind: type | tuple[type, ...], needed: str) -> Any:
+    """`value` if it is an instance of `kind`, which the message calls `needed`."""
+    if not isinstance(value, kind):
+        raise _refuse(name, value, needed)
+    return value

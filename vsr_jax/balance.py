@@ -1,0 +1,156 @@
+r"""The balance of a cross-section: the kernel that every model shares.
+
+At every X the rod's elastic wrench, the threads' wrench and the reaction $\Lambda$ to the loads beyond X are in balance,
+
+$$r(\xi) = \Sigma (\xi - \xi^*) - B_\tau(\xi) \tau - \Lambda = 0. \qquad (21)$$
+
+Column i of $B_\tau$ is $(d \times t, t) = \partial |t_c| / \partial \xi$, the gradient of thread i's length, so the tangent
+
+$$H = \partial r / \partial \xi = \Sigma - A, \qquad A = \sum_i \frac{\tau_i}{|t_c|} P^T (1 - t t^T) P, \qquad P = [-\tilde d, 1] \qquad (13)$$
+
+is symmetric. Symbols, each a tuple of component arrays of one shape (see `component`):
+
+- `xi` $= (k\,[1/m], u\,[-])$: strain, angular first; `rest` $= \xi^*$; `stiffness`: the diagonal of $\Sigma$;
+- $d = (0, d_y, d_z)$ [m]: where a thread crosses the section; $t_c = k \times d + u + d'$ its tangent, $t = t_c / |t_c|$;
+- `tau` [N]: thread force, negative for a tendon; `reaction` $= \Lambda$ [N m, N].
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .component import Matrix, Vector, add, cholesky, cholesky_solve, dot, scale, subtract
+from .newton import Evaluation, newton
+from .routing import Path
+from .scene import CrossSections
+
+
+class Balance(NamedTuple):
+    """Solution of the balance: strain, whether it was reached, whether $H$ is positive definite there, Newton steps."""
+
+    xi: Vector
+    balanced: Array
+    definite: Array
+    steps: Array
+
+
+def thread_tangent(xi: Vector, path: Path) -> Vector:
+    """Tangent of a thread's path in the section's frame (eq. 11): $t_c = k \\times d + u + d'$."""
+    kx, ky, kz, ux, uy, uz = xi
+    return (ux + ky * path.z - kz * path.y, uy + path.slope_y - kx * path.z, uz + path.slope_z + kx * path.y)
+
+
+def thread_direction(xi: Vector, path: Path) -> tuple[Vector, Array]:
+    """Unit tangent $t$ of a thread and the length $|t_c|$ of its path per unit length of the arm."""
+    t_c = thread_tangent(xi, path)
+    length = jnp.sqrt(dot(t_c, t_c))
+    return tuple(x / length for x in t_c), length
+
+
+def thread_wrench(t: Vector, path: Path) -> Vector:
+    """Wrench of a unit force along $t$ in a thread (eq. 10): $(d \\times t, t)$."""
+    return (path.y * t[2] - path.z * t[1], path.z * t[0], -path.y * t[0], *t)
+
+
+def actuation_wrench(xi: Vector, sections: CrossSections, tau: Vector) -> Vector:
+    """Wrench of all threads (eq. 17): $F_a = B_\\tau(\\xi) \\tau$."""
+    total = tuple(jnp.zeros_like(x) for x in xi)
+    for path, force in zip(sections.paths, tau, strict=True):
+        total = add(total, scale(force, thread_wrench(thread_direction(xi, path)[0], path)))
+    return total
+
+
+def residual(xi: Vector, sections: CrossSections, tau: Vector, reaction: Vector | None = None) -> Vector:
+    """Imbalance of a cross-section (eq. 21): $r = \\Sigma (\\xi - \\xi^*) - B_\\tau \\tau - \\Lambda$."""
+    elastic = tuple(s * x for s, x in zip(sections.stiffness, subtract(xi, sections.rest), strict=True))
+    r = subtract(elastic, actuation_wrench(xi, sections, tau))
+    return r if reaction is None else subtract(r, reaction)
+
+
+def tangent(xi: Vector, sections: CrossSections, tau: Vector) -> Matrix:
+    """Lower triangle of the tangent stiffness (eq. 12-13): $H = \\Sigma - A$."""
+    zero = jnp.zeros_like(xi[0])
+    rows = [[zero] * i + [sections.stiffness[i]] for i in range(6)]
+    for path, force in zip(sections.paths, tau, strict=True):
+        y, z = path.y, path.z
+        t, length = thread_direction(xi, path)
+        weight = force / length
+        w = [[weight * ((1.0 if i == j else 0.0) - t[i] * t[j]) for j in range(3)] for i in range(3)]
+        dw = [[y * w[2][j] - z * w[1][j] for j in range(3)], [z * x for x in w[0]], [-y * x for x in w[0]]]  # d~ W
+        dwd = [[y * row[2] - z * row[1], z * row[0], -y * row[0]] for row in dw]  # d~ W d~^T
+        for i in range(3):
+            for j in range(i + 1):
+                rows[i][j] = rows[i][j] - dwd[i][j]
+                rows[3 + i][3 + j] = rows[3 + i][3 + j] - w[i][j]
+            for j in range(3):
+                rows[3 + i][j] = rows[3 + i][j] - dw[j][i]
+    return tuple(tuple(row) for row in rows)
+
+
+def strain_norm(wrench: Vector, stiffness: Vector) -> Array:
+    r"""Size of a wrench as a strain without unit, $\sqrt{F^T \Sigma^{-1} F / \Sigma_{44}}$: the same for every scale of arm."""
+    return jnp.sqrt(dot(wrench, tuple(f / s for f, s in zip(wrench, stiffness, strict=True))) / stiffness[3])
+
+
+def rounding_floor(stiffness: Vector, tau: Vector) -> Array:
+    """What is left of `strain_norm` of a balanced residual in floating point: a multiple of the machine's epsilon."""
+    load = sum((jnp.abs(force) for force in tau), jnp.zeros_like(stiffness[3]))
+    return 64 * jnp.finfo(stiffness[3].dtype).eps * (1 + load / stiffness[3])
+
+
+def no_derivative(*values: Array) -> tuple[Any, ...]:
+    """Tangents of integer and boolean outputs."""
+    return tuple(np.zeros(value.shape, jax.dtypes.float0) for value in values)
+
+
+@jax.custom_jvp
+def solve_balance(sections: CrossSections, tau: Vector, reaction: Vector | None = None) -> Balance:
+    r"""Strain that balances each cross-section (eq. 21), by Newton's method from the rest strain.
+
+    Where $H$ is not positive definite the step is $\Sigma^{-1} r$. Derivatives of any order are implicit,
+    $d\xi = -H^{-1} dr$, in forward and reverse mode.
+
+    **Arguments:** component arrays of one shape; `reaction` is left out where there are no external loads.
+
+    **Returns:** a `Balance`. `xi` is the last iterate whether or not it is balanced.
+    """
+    stiffness = sections.stiffness
+    shape = jnp.broadcast_shapes(*(x.shape for x in (*stiffness, *sections.rest, *tau, *(reaction or ()))))
+    rest = tuple(jnp.broadcast_to(x, shape) for x in sections.rest)
+    floor = jnp.broadcast_to(rounding_floor(stiffness, tau), shape)
+
+    def evaluate(xi: Vector) -> Evaluation:
+        r = residual(xi, sections, tau, reaction)
+        step = cholesky_solve(cholesky(tangent(xi, sections, tau)), r)
+        definite = ~jnp.isnan(step[5])
+        step = tuple(jnp.where(definite, x, f / s) for x, f, s in zip(step, r, stiffness, strict=True))
+        size = strain_norm(tuple(s * x for s, x in zip(stiffness, step, strict=True)), stiffness)
+        return Evaluation(step, size, strain_norm(r, stiffness), definite)
+
+    xi, definite, steps = newton(evaluate, rest, floor)
+    balanced = strain_norm(residual(xi, sections, tau, reaction), stiffness) <= 16 * floor
+    return Balance(xi, balanced, definite, steps)
+
+
+@solve_balance.defjvp
+def _solve_balance_jvp(primals: tuple, tangents: tuple) -> tuple[Balance, Balance]:
+    sections, tau, reaction = primals
+    solution = solve_balance(sections, tau, reaction)
+    # Where nothing was balanced there is no derivative: take it at rest without forces, where it is finite, so that no
+    # other lane of a batch is harmed.
+    sound = solution.balanced & solution.definite
+    xi = tuple(jnp.where(sound, x, rest) for x, rest in zip(solution.xi, sections.rest, strict=True))
+
+    def sound_forces(tau: Vector) -> Vector:
+        return tuple(jnp.where(sound, force, 0.0) for force in tau)
+
+    def imbalance(sections: CrossSections, tau: Vector, reaction: Vector | None) -> Vector:
+        return residual(xi, sections, sound_forces(tau), reaction)
+
+    _, change = jax.jvp(imbalance, primals, tangents)
+    factor = cholesky(tangent(xi, sections, sound_forces(tau)))
+    d_xi = scale(-1.0, cholesky_solve(factor, change))
+    return solution, Balance(d_xi, *no_derivative(*solution[1:]))

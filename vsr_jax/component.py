@@ -1,0 +1,119 @@
+"""Vectors and small matrices whose components are separate arrays.
+
+A vector is a tuple of three arrays, a twist or a wrench a tuple of six (angular part first), a matrix a tuple of rows.
+All components share one shape: a scalar for a single cross-section, `(nodes,)` along an arm, with a batch axis in front
+under `jax.vmap`. Written this way the kernels are plain elementwise arithmetic, which XLA fuses into a few loops;
+small batched `dot_general`, `concatenate` and LAPACK calls, which it cannot fuse, never appear.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+Vector = tuple[Array, ...]
+Matrix = tuple[Vector, ...]
+
+
+def split(array: Array) -> Vector:
+    """Components of the last axis of `array`."""
+    return tuple(array[..., i] for i in range(array.shape[-1]))
+
+
+def join(components: Vector) -> Array:
+    """Array whose last axis holds `components`; the inverse of `split`."""
+    return jnp.stack(jnp.broadcast_arrays(*components), axis=-1)
+
+
+def join_matrix(rows: Matrix) -> Array:
+    """Array whose last two axes hold the matrix `rows`."""
+    return jnp.stack([join(row) for row in rows], axis=-2)
+
+
+def split_matrix(array: Array) -> Matrix:
+    """Rows of components of the last two axes of `array`; the inverse of `join_matrix`."""
+    return tuple(split(array[..., i, :]) for i in range(array.shape[-2]))
+
+
+def add(a: Vector, b: Vector) -> Vector:
+    """Sum $a + b$, component by component."""
+    return tuple(x + y for x, y in zip(a, b, strict=True))
+
+
+def subtract(a: Vector, b: Vector) -> Vector:
+    """Difference $a - b$, component by component."""
+    return tuple(x - y for x, y in zip(a, b, strict=True))
+
+
+def scale(s: Array | float, a: Vector) -> Vector:
+    """Product $s a$ of a scalar and a vector."""
+    return tuple(s * x for x in a)
+
+
+def dot(a: Vector, b: Vector) -> Array:
+    """Scalar product $a \\cdot b$."""
+    total = a[0] * b[0]
+    for x, y in zip(a[1:], b[1:], strict=True):
+        total = total + x * y
+    return total
+
+
+def cross(a: Vector, b: Vector) -> Vector:
+    """Vector product $a \\times b$ of two vectors of three components."""
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+def matvec(matrix: Matrix, vector: Vector) -> Vector:
+    """Product of a matrix and a vector."""
+    return tuple(dot(row, vector) for row in matrix)
+
+
+def transpose(matrix: Matrix) -> Matrix:
+    """Transposed matrix."""
+    return tuple(zip(*matrix, strict=True))
+
+
+def matmul(a: Matrix, b: Matrix) -> Matrix:
+    """Product of two matrices."""
+    columns = transpose(b)
+    return tuple(tuple(dot(row, column) for column in columns) for row in a)
+
+
+def cholesky(lower: Matrix) -> Matrix:
+    """Cholesky factor $L$, $A = L L^T$, of a symmetric matrix, unrolled.
+
+    Every entry of $L$ ends in a division or a square root, which XLA does not compute twice; factors whose entries end
+    in a product or a sum (an $L D L^T$) are recomputed in each of their uses and cost twice as much (measured).
+
+    **Arguments:**
+    - `lower`: the lower triangle of $A$: row `i` holds `i + 1` components.
+
+    **Returns:** the lower triangle of $L$; its last row is NaN where $A$ is not positive definite.
+    """
+    factor: list[list[Array]] = []
+    for i, row in enumerate(lower):
+        entries: list[Array] = []
+        for j in range(i):
+            remainder = row[j]
+            for k in range(j):
+                remainder = remainder - entries[k] * factor[j][k]
+            entries.append(remainder / factor[j][j])
+        pivot = row[i]
+        for entry in entries:
+            pivot = pivot - entry * entry
+        entries.append(jnp.sqrt(pivot))
+        factor.append(entries)
+    return tuple(tuple(row) for row in factor)
+
+
+def cholesky_solve(factor: Matrix, right: Vector) -> Vector:
+    """Solution $x$ of $L L^T x = b$ with the factor of `cholesky`."""
+    x = list(right)
+    size = len(x)
+    for i in range(size):
+        for j in range(i):
+            x[i] = x[i] - factor[i][j] * x[j]
+        x[i] = x[i] / factor[i][i]
+    for i in reversed(range(size)):
+        for j in range(i + 1, size):
+            x[i] = x[i] - factor[j][i] * x[j]
+        x[i] = x[i] / factor[i][i]
+    return tuple(x)

@@ -1,0 +1,185 @@
+r"""The continuous Cosserat model (eq. 12), integrated by diffrax from the tip, where $F_i(L) = F_a(L)$, to the base."""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from . import component as c
+from ._check import count, instance, numbers
+from ._types import Pose, Scalar, Twist
+from .balance import residual, rounding_floor, solve_balance, strain_norm, tangent
+from .component import Vector
+from .model import Model, Outcome, Status, classify
+from .quadrature import Grid
+from .scene import CrossSections, Scene
+from .se3 import coad, hat, inverse
+from .strain_dependent import StrainDependent
+
+
+class Line(NamedTuple):
+    """What is integrated: the strain and the pose relative to the tip's frame."""
+
+    xi: Twist
+    g: Pose
+
+
+def strain_rate(scene: Scene, tau: Vector, xi: Twist, X: Scalar) -> Twist:
+    r"""Right side of eq. (12): $\xi' = (\Sigma - A)^{-1} (a - b - c)$.
+
+    With $r = F_i - F_a$ the balance (8) is $r' + \mathrm{ad}^*_\xi r = 0$, and $r' = H \xi' + \partial r / \partial X$: so
+    $\xi' = -H^{-1} (\partial r / \partial X + \mathrm{ad}^*_\xi r)$, where $-\partial r / \partial X = a - c$ of eq. (13) is taken by
+    forward differentiation of the sections and $\mathrm{ad}^*_\xi r$ is b.
+    """
+    parts = c.split(xi)
+
+    def imbalance(x: Scalar) -> tuple[Array, CrossSections]:
+        sections = scene.sections(x)
+        return c.join(residual(parts, sections, tau)), sections
+
+    r, change, sections = jax.jvp(imbalance, (X,), (jnp.ones_like(X),), has_aux=True)
+    H = c.cholesky(tangent(parts, sections, tau))
+    return -c.join(c.cholesky_solve(H, c.split(change + coad(xi) @ r)))
+
+
+class Continuum(Model):
+    """The continuous model as an initial value problem in X.
+
+    Derivatives are implicit. The solution of eq. (8) satisfies the balance (21) at every X, so its exact derivative is
+    that of the balance, which `derivative`, a `StrainDependent` model, carries to the poses; the adaptive integration is
+    never unrolled.
+
+    **Arguments:**
+    - `solver`: a diffrax solver, `diffrax.Dopri8()` by default.
+    - `rtol`, `atol`: tolerances of the step size control, at least four times the machine's epsilon.
+    - `max_steps`: bound on the number of steps.
+    - `derivative`: the steps on which derivatives are computed.
+    """
+
+    solver: diffrax.AbstractSolver
+    rtol: float = eqx.field(static=True)
+    atol: float = eqx.field(static=True)
+    max_steps: int = eqx.field(static=True)
+    derivative: StrainDependent
+
+    def __init__(
+        self,
+        solver: diffrax.AbstractSolver | None = None,
+        rtol: float = 1e-8,
+        atol: float = 1e-10,
+        max_steps: int = 4096,
+        derivative: StrainDependent | None = None,
+    ):
+        chosen = diffrax.Dopri8() if solver is None else solver
+        self.solver = instance("Continuum.solver", chosen, diffrax.AbstractSolver, "a diffrax solver")
+        self.rtol = float(numbers("Continuum.rtol", rtol, positive=True))
+        self.atol = float(numbers("Continuum.atol", atol, positive=True))
+        self.max_steps = count("Continuum.max_steps", max_steps)
+        steps = StrainDependent(64) if derivative is None else derivative
+        self.derivative = instance("Continuum.derivative", steps, StrainDependent, "a StrainDependent model")
+
+    def solve(self, scene: Scene, inputs: Float[Array, " inputs"]) -> Outcome:
+        tip, status, steps = _tip(self, scene, inputs)
+        return Outcome(tip, status, steps)
+
+    def strain(self, scene: Scene, inputs: Float[Array, " inputs"], state: Pose, X: Float[Array, " stations"]) -> Vector:
+        return c.split(_line(self, scene, inputs, X).xi)
+
+    def tip(self, scene: Scene, inputs: Float[Array, " inputs"], state: Pose) -> Pose:
+        return _from_base(scene, state)
+
+    def poses(
+        self, scene: Scene, inputs: Float[Array, " inputs"], state: Any, X: Float[Array, " stations"]
+    ) -> Float[Array, "stations 4 4"]:
+        return _from_base(scene, _line(self, scene, inputs, X).g)
+
+    def grid(self, scene: Scene) -> Grid:
+        return self.derivative.grid(scene)
+
+
+def _from_base(scene: Scene, g: Array) -> Array:
+    return g if scene.rod.base is None else scene.rod.base @ g
+
+
+@eqx.filter_custom_jvp
+def _tip(model: Continuum, scene: Scene, inputs: Array) -> tuple[Pose, Array, Array]:
+    """Pose of the tip relative to the base, the status and the number of steps."""
+    ys, status, steps = _integrate(model, scene, inputs, diffrax.SaveAt(t1=True))
+    line = jax.tree.map(lambda y: y[0], ys)
+    tau, sections = scene.forces(inputs), scene.sections(jnp.zeros_like(scene.rod.length))
+    imbalance = strain_norm(residual(c.split(line.xi), sections, tau), sections.stiffness)
+    # Where the path branched or jumped the integration carries on but loses the balance.
+    balanced = imbalance <= rounding_floor(sections.stiffness, tau) + 100 * (model.rtol + model.atol) ** 0.5
+    status = jnp.where((status == Status.CONVERGED) & ~balanced, Status.MAX_STEPS, status).astype(jnp.int32)
+    tip = jnp.where(status == Status.CONVERGED, inverse(line.g), jnp.eye(4, dtype=line.g.dtype))
+    return tip, status, steps
+
+
+@_tip.def_jvp
+def _tip_jvp(primals: tuple, tangents: tuple) -> tuple:
+    def derivative(model: Continuum, scene: Scene, inputs: Array) -> Pose:
+        origin = _at_origin(scene)
+        return model.derivative.tip(origin, inputs, model.derivative.solve(origin, inputs).state)
+
+    _, change = eqx.filter_jvp(derivative, primals, tangents)
+    return _tip(*primals), (change, None, None)
+
+
+@eqx.filter_custom_jvp
+def _line(model: Continuum, scene: Scene, inputs: Array, X: Array) -> Line:
+    """Strain and pose relative to the base at abscissas X in any order."""
+    order = jnp.argsort(-X)
+    line, _, _ = _integrate(model, scene, inputs, diffrax.SaveAt(ts=jnp.append(X[order], 0.0)))
+    from_base = inverse(line.g[-1]) @ line.g[:-1]
+    return jax.tree.map(lambda y: jnp.zeros_like(y).at[order].set(y), Line(line.xi[:-1], from_base))
+
+
+@_line.def_jvp
+def _line_jvp(primals: tuple, tangents: tuple) -> tuple[Line, Line]:
+    def derivative(model: Continuum, scene: Scene, inputs: Array, X: Array) -> Line:
+        steps, origin = model.derivative, _at_origin(scene)
+        state = steps.solve(origin, inputs).state
+        return Line(c.join(steps.strain(origin, inputs, state, X)), steps.poses(origin, inputs, state, X))
+
+    _, change = eqx.filter_jvp(derivative, primals, tangents)
+    return _line(*primals), change
+
+
+def _at_origin(scene: Scene) -> Scene:
+    return eqx.tree_at(lambda s: s.rod.base, scene, None, is_leaf=lambda x: x is None)
+
+
+def _integrate(model: Continuum, scene: Scene, inputs: Array, saveat: diffrax.SaveAt) -> tuple[Line, Array, Array]:
+    """Strain and pose relative to the tip where `saveat` says, the status and the number of steps."""
+    tau, length = scene.forces(inputs), scene.rod.length
+    sections = scene.sections(length)
+    end = solve_balance(sections, tau)
+    status = classify(end.xi, sections, tau, end.balanced, end.definite)
+    sound = status == Status.CONVERGED
+    xi = jnp.where(sound, c.join(end.xi), c.join(sections.rest))
+    tau = tuple(jnp.where(sound, force, 0.0) for force in tau)
+
+    def field(x: Any, line: Line, _: None) -> Line:
+        return Line(strain_rate(scene, tau, line.xi, x), line.g @ hat(line.xi))
+
+    finest = 4 * float(jnp.finfo(xi.dtype).eps)
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(field),
+        model.solver,
+        t0=length,
+        t1=jnp.zeros_like(length),
+        dt0=None,
+        y0=Line(xi, jnp.eye(4, dtype=xi.dtype)),
+        saveat=saveat,
+        stepsize_controller=diffrax.PIDController(rtol=max(model.rtol, finest), atol=max(model.atol, finest)),
+        max_steps=model.max_steps,
+        adjoint=diffrax.ForwardMode(),
+        throw=False,
+    )
+    assert solution.ys is not None
+    completed = solution.result == diffrax.RESULTS.successful
+    status = jnp.where(sound & ~completed, Status.MAX_STEPS, status)
+    return solution.ys, status, solution.stats["num_steps"].astype(jnp.int32)

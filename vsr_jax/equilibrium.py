@@ -1,0 +1,143 @@
+"""What a solve returns: the status, and the shape, strains, stability and thread lengths computed when asked for."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from . import component as c
+from ._check import is_traced
+from ._types import Pose, Scalar
+from .balance import tangent, thread_direction
+from .model import Model, Outcome, Status
+from .scene import Scene
+
+
+class Equilibrium(eqx.Module):
+    """A solved scene.
+
+    Every quantity is computed when it is asked for, so that a program that only needs the tip computes only the tip.
+    Where the solve failed every quantity is NaN and `status` says why.
+
+    **Fields:** `scene`, `inputs` [of the actuators], `model`; `status`, a `Status` as an integer; `steps`, the Newton
+    steps taken (integration steps for `Continuum`).
+    """
+
+    scene: Scene
+    inputs: Float[Array, " inputs"]
+    model: Model
+    status: Array
+    steps: Array
+    _state: Any
+
+    def __init__(self, scene: Scene, inputs: Float[Array, " inputs"], model: Model, outcome: Outcome):
+        self.scene, self.inputs, self.model = scene, inputs, model
+        self._state, self.status, self.steps = outcome
+
+    @property
+    def converged(self) -> Bool[Array, "..."]:
+        """Whether the result is an equilibrium, balanced to rounding."""
+        return self.status == Status.CONVERGED
+
+    @property
+    def message(self) -> str:
+        """The status in words."""
+        return Status(int(self.status)).message
+
+    @property
+    def q(self) -> Float[Array, " dofs"]:
+        """Coordinates of the strain in the model's basis: those of `Prescribed`, the thread forces for `StrainDependent`."""
+        if isinstance(self._state, jax.Array):
+            return self._mask(self._state)
+        return self._mask(jnp.stack(self.scene.forces(self._sound_inputs)))
+
+    @property
+    def tip(self) -> Pose:
+        """Pose of the arm's end, shape (4, 4), position in metres."""
+        return self._tip()
+
+    def pose(self, X: Any) -> Float[Array, "... 4 4"]:
+        """Pose $g(X)$ at one abscissa [m] or at many, shape (4, 4) or (stations, 4, 4)."""
+        return self._poses(self._abscissas(X))
+
+    def position(self, X: Any) -> Float[Array, "... 3"]:
+        """Position $r(X)$ [m] of the axis at one abscissa [m] or at many."""
+        return self.pose(X)[..., :3, 3]
+
+    def strain(self, X: Any) -> Float[Array, "... 6"]:
+        r"""Strain $\xi(X) = (k\,[1/m], u\,[-])$ at one abscissa [m] or at many."""
+        return self._strain(self._abscissas(X))
+
+    @property
+    def stability(self) -> Scalar:
+        r"""Margin of stability: the least eigenvalue of $\Sigma^{-1/2} (\Sigma - A) \Sigma^{-1/2}$ over the nodes.
+
+        1 for an arm without forces, at least 1 for tendons alone up to rounding, 0 where the equilibrium ceases to be stable.
+        """
+        return self._stability()
+
+    @property
+    def lengths(self) -> Float[Array, " threads"]:
+        """Length of each thread's path, $l_i = \\int |t_{ci}| dX$ [m]."""
+        return self._lengths()
+
+    def thread(self, index: int, X: Any) -> Float[Array, "... 3"]:
+        """Position [m] of thread `index` where it crosses the sections at X: $r + R d$."""
+        stations = self._abscissas(X)
+        g, path = self.pose(stations), self.scene.sections(stations).paths[index]
+        return g[..., :3, 3] + g[..., :3, 1] * path.y[..., None] + g[..., :3, 2] * path.z[..., None]
+
+    def __repr__(self) -> str:
+        if is_traced(self.status) or jnp.ndim(self.status) > 0:
+            return f"Equilibrium(model={type(self.model).__name__}, batch={jnp.shape(self.status)})"
+        if not bool(self.converged):
+            return f"Equilibrium(model={type(self.model).__name__}, {self.message})"
+        x, y, z = (float(v) for v in self.tip[:3, 3])
+        return f"Equilibrium(model={type(self.model).__name__}, converged, tip=({x:.6g}, {y:.6g}, {z:.6g}) m)"
+
+    @property
+    def _sound_inputs(self) -> Array:
+        return jnp.where(self.converged, self.inputs, 0.0)
+
+    def _mask(self, value: Array) -> Array:
+        return jnp.where(self.converged, value, jnp.nan)
+
+    def _abscissas(self, X: Any) -> Array:
+        array = jnp.asarray(X, self.inputs.dtype)
+        if array.ndim > 1:
+            raise ValueError(f"X: got shape {array.shape}, need one abscissa or several in a row")
+        return array
+
+    @eqx.filter_jit
+    def _tip(self) -> Pose:
+        return self._mask(self.model.tip(self.scene, self._sound_inputs, self._state))
+
+    @eqx.filter_jit
+    def _poses(self, X: Array) -> Array:
+        poses = self.model.poses(self.scene, self._sound_inputs, self._state, jnp.atleast_1d(X))
+        return self._mask(poses.reshape(*X.shape, 4, 4))
+
+    @eqx.filter_jit
+    def _strain(self, X: Array) -> Array:
+        strain = self.model.strain(self.scene, self._sound_inputs, self._state, jnp.atleast_1d(X))
+        return self._mask(c.join(strain).reshape(*X.shape, 6))
+
+    def _along(self) -> tuple:
+        grid = self.model.grid(self.scene)
+        X = grid.X.reshape(-1)
+        return self.model.strain(self.scene, self._sound_inputs, self._state, X), self.scene.sections(X), grid.weight.reshape(-1)
+
+    @eqx.filter_jit
+    def _stability(self) -> Scalar:
+        xi, sections, _ = self._along()
+        lower = tangent(xi, sections, self.scene.forces(self._sound_inputs))
+        root = tuple(jnp.sqrt(s) for s in sections.stiffness)
+        scaled = tuple(tuple(lower[max(i, j)][min(i, j)] / (root[i] * root[j]) for j in range(6)) for i in range(6))
+        return self._mask(jnp.min(jnp.linalg.eigvalsh(c.join_matrix(scaled))))
+
+    @eqx.filter_jit
+    def _lengths(self) -> Array:
+        xi, sections, weight = self._along()
+        return self._mask(jnp.stack([jnp.sum(weight * thread_direction(xi, path)[1]) for path in sections.paths]))

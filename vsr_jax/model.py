@@ -1,0 +1,136 @@
+"""What every model of a scene offers, and what those that advance by Magnus steps share."""
+
+from abc import abstractmethod
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ._types import Pose
+from .balance import thread_tangent
+from .component import Vector, dot
+from .kinematics import step_components, step_poses, tip_pose
+from .quadrature import Grid, gauss_legendre, make_grid
+from .scene import CrossSections, Scene
+from .se3 import exp_components, pose
+
+
+class Status(IntEnum):
+    """How a solve ended; every status but `CONVERGED` comes with a shape of NaN."""
+
+    CONVERGED = 0
+    MAX_STEPS = 1
+    UNSTABLE = 2
+    COLLAPSED = 3
+    NOT_FINITE = 4
+    INADMISSIBLE = 5
+
+    @property
+    def message(self) -> str:
+        """The status in words."""
+        return _MESSAGES[self]
+
+
+_MESSAGES = {
+    Status.CONVERGED: "converged",
+    Status.MAX_STEPS: "the residual could not be brought down to rounding",
+    Status.UNSTABLE: "the equilibrium is not stable: the tangent stiffness is not positive definite",
+    Status.COLLAPSED: "collapsed: a thread has shortened its own path, or the arm, to nothing",
+    Status.NOT_FINITE: "an input or an intermediate value is not finite",
+    Status.INADMISSIBLE: "an input lies outside its actuator's range",
+}
+
+
+class Outcome(NamedTuple):
+    """What a model's solve hands back: its own state (finite even where it failed), a `Status` and the Newton steps."""
+
+    state: Any
+    status: Array
+    steps: Array
+
+
+class Model(eqx.Module):
+    """A way to find and to describe the equilibrium of a scene."""
+
+    @abstractmethod
+    def solve(self, scene: Scene, inputs: Float[Array, " inputs"]) -> Outcome:
+        """Equilibrium for admissible inputs."""
+
+    @abstractmethod
+    def strain(self, scene: Scene, inputs: Float[Array, " inputs"], state: Any, X: Float[Array, " stations"]) -> Vector:
+        r"""Strain $\xi$ at abscissas X, six component arrays."""
+
+    @abstractmethod
+    def tip(self, scene: Scene, inputs: Float[Array, " inputs"], state: Any) -> Pose:
+        """Pose of the arm's end."""
+
+    @abstractmethod
+    def poses(
+        self, scene: Scene, inputs: Float[Array, " inputs"], state: Any, X: Float[Array, " stations"]
+    ) -> Float[Array, "stations 4 4"]:
+        """Poses at abscissas X."""
+
+    @abstractmethod
+    def grid(self, scene: Scene) -> Grid:
+        """Steps and nodes on which quantities along the arm are summed."""
+
+
+class SteppedModel(Model):
+    """A model whose pose advances by Magnus steps on the strain at their Gauss points."""
+
+    steps: eqx.AbstractVar[int]
+    order: eqx.AbstractVar[int]
+
+    @abstractmethod
+    def node_strain(self, scene: Scene, inputs: Float[Array, " inputs"], state: Any) -> Vector:
+        """Strain at the nodes of `grid`, six component arrays of shape (stages, steps)."""
+
+    def breakpoints(self, scene: Scene) -> tuple[Array, ...]:
+        """Abscissas [m] where steps break besides those of the scene."""
+        return ()
+
+    def grid(self, scene: Scene) -> Grid:
+        return make_grid(scene.edges(self.breakpoints(scene)), self.steps, self.order // 2)
+
+    def tip(self, scene: Scene, inputs: Float[Array, " inputs"], state: Any) -> Pose:
+        return tip_pose(self.node_strain(scene, inputs, state), self.grid(scene).h, scene.rod.base)
+
+    def poses(
+        self, scene: Scene, inputs: Float[Array, " inputs"], state: Any, X: Float[Array, " stations"]
+    ) -> Float[Array, "stations 4 4"]:
+        grid = self.grid(scene)
+        ends = step_poses(self.node_strain(scene, inputs, state), grid.h, scene.rod.base)
+        step = jnp.clip(jnp.searchsorted(grid.start, X, side="right") - 1, 0, grid.start.size - 1)
+        h = X - grid.start[step]
+        nodes = gauss_legendre(self.order // 2)[0].astype(h.dtype)
+        X_nodes = grid.start[step] + nodes[:, None] * h
+        strain = self.strain(scene, inputs, state, X_nodes.reshape(-1))
+        stages = tuple(tuple(x.reshape(X_nodes.shape)[i] for x in strain) for i in range(len(nodes)))
+        return jax.vmap(jnp.matmul)(ends[step], pose(*exp_components(step_components(stages, h))))
+
+
+def classify(xi: Vector, sections: CrossSections, tau: Vector, balanced: Array, definite: Array) -> Array:
+    """`Status` from the strain, whether it balances and whether the tangent is positive definite, over all nodes.
+
+    With tendons alone the energy is convex, so a node that cannot be balanced has its least energy at a kink, where the
+    path of a thread has no length left: it has collapsed. So has a node where a path, or the axis, has turned over.
+    """
+    pulling = jnp.all(jnp.stack([force <= 0 for force in tau])) if tau else jnp.array(False)
+    left = xi[3] / sections.rest[3]
+    for path in sections.paths:
+        rest = thread_tangent(sections.rest, path)
+        left = jnp.minimum(left, dot(thread_tangent(xi, path), rest) / dot(rest, rest))
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in xi]))
+    collapsed = jnp.any(~balanced & pulling) | jnp.any(left <= 0)
+    status = jnp.where(jnp.all(balanced), Status.CONVERGED, Status.MAX_STEPS)
+    status = jnp.where(jnp.all(definite), status, Status.UNSTABLE)
+    status = jnp.where(collapsed, Status.COLLAPSED, status)
+    return jnp.where(finite, status, Status.NOT_FINITE).astype(jnp.int32)
+
+
+def rest_where_failed(status: Array, xi: Vector, sections: CrossSections) -> Vector:
+    """`xi`, replaced by the rest strain where the solve failed, so that what follows stays finite."""
+    return tuple(jnp.where(status == Status.CONVERGED, x, rest) for x, rest in zip(xi, sections.rest, strict=True))

@@ -1,0 +1,155 @@
+"""Profiles: scalar functions of X along an arm, for sizes and rest strains.
+
+A profile is called as `profile(X, length)` with scalars and is differentiable in both and in each of its numbers.
+Wherever a profile is expected a plain number means `Constant` and a Python function of X means `FunctionProfile`.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ._check import concrete, numbers
+from ._types import Scalar
+
+
+class Profile(eqx.Module):
+    """A scalar function of X on an arm of a given length."""
+
+    @abstractmethod
+    def __call__(self, X: Scalar, length: Scalar) -> Scalar:
+        """Value at X [m]."""
+
+    @property
+    def breakpoints(self) -> tuple[Scalar, ...]:
+        """Abscissas [m] where a derivative jumps: quadrature and steps break there."""
+        return ()
+
+
+class Constant(Profile):
+    """$f(X) = c$."""
+
+    value: Scalar
+
+    def __init__(self, value: Any):
+        self.value = numbers("Constant.value", value)
+
+    def __call__(self, X: Scalar, length: Scalar) -> Scalar:
+        return self.value
+
+
+class Taper(Profile):
+    """$f(X) = f_b + (f_t - f_b) X / L$: from `base` at X = 0 to `tip` at X = L."""
+
+    base: Scalar
+    tip: Scalar
+
+    def __init__(self, base: Any, tip: Any):
+        self.base = numbers("Taper.base", base)
+        self.tip = numbers("Taper.tip", tip)
+
+    def __call__(self, X: Scalar, length: Scalar) -> Scalar:
+        return self.base + (self.tip - self.base) * (X / length)
+
+
+class PolynomialProfile(Profile):
+    """$f(X) = \\sum_i c_i X^i$, `coefficients` in rising order, units of $f$ per m^i."""
+
+    coefficients: Float[Array, " terms"]
+
+    def __init__(self, coefficients: Any):
+        self.coefficients = numbers("PolynomialProfile.coefficients", coefficients, None)
+        if self.coefficients.ndim != 1 or self.coefficients.size == 0:
+            raise ValueError(f"PolynomialProfile.coefficients: got shape {self.coefficients.shape}, need at least one number in a row")
+
+    def __call__(self, X: Scalar, length: Scalar) -> Scalar:
+        return jnp.polyval(self.coefficients[::-1], X)
+
+
+class SplineProfile(Profile):
+    """Cubic not-a-knot spline through `values` at the abscissas `X` [m].
+
+    Two points give the straight line and three the parabola through them. Beyond the first and last point the end
+    pieces go on. **Source:** C. de Boor, A Practical Guide to Splines, ch. IV.
+    """
+
+    X: Float[Array, " points"]
+    values: Float[Array, " points"]
+
+    def __init__(self, X: Any, values: Any):
+        self.X = numbers("SplineProfile.X", X, None)
+        self.values = numbers("SplineProfile.values", values, self.X.shape)
+        if self.X.ndim != 1 or self.X.size < 2:
+            raise ValueError(f"SplineProfile.X: got shape {self.X.shape}, need at least two abscissas in a row")
+        known = concrete(self.X)
+        if known is not None and not np.all(np.diff(known) > 0):
+            raise ValueError(f"SplineProfile.X: got {known.tolist()}, need rising abscissas")
+
+    @property
+    def breakpoints(self) -> tuple[Scalar, ...]:
+        return tuple(self.X[i] for i in range(2, self.X.size - 2))
+
+    def _slopes(self) -> Float[Array, " points"]:
+        x, h = self.X, jnp.diff(self.X)
+        secant = jnp.diff(self.values) / h
+        n = x.size
+        if n == 2:
+            return jnp.stack([secant[0], secant[0]])
+        if n == 3:
+            second = (secant[1] - secant[0]) / (x[2] - x[0])
+            return jnp.stack([secant[0] - second * h[0], secant[0] + second * h[0], secant[1] + second * h[1]])
+        matrix = jnp.zeros((n, n), x.dtype)
+        i = np.arange(1, n - 1)
+        matrix = matrix.at[i, i - 1].set(h[1:]).at[i, i].set(2 * (h[:-1] + h[1:])).at[i, i + 1].set(h[:-1])
+        right = jnp.zeros_like(x).at[i].set(3 * (h[1:] * secant[:-1] + h[:-1] * secant[1:]))
+        for row, sign, (p, q), (s, t) in ((0, 1, h[:2], secant[:2]), (n - 1, -1, h[-2:][::-1], secant[-2:][::-1])):
+            matrix = matrix.at[row, row].set(q).at[row, row + sign].set(p + q)
+            right = right.at[row].set(((p + 2 * (p + q)) * q * s + p**2 * t) / (p + q))
+        return jnp.linalg.solve(matrix, right)
+
+    def __call__(self, X: Scalar, length: Scalar) -> Scalar:
+        slopes = self._slopes()
+        i = jnp.clip(jnp.searchsorted(self.X, X, side="right") - 1, 0, self.X.size - 2)
+        h = self.X[i + 1] - self.X[i]
+        s = (X - self.X[i]) / h
+        secant = (self.values[i + 1] - self.values[i]) / h
+        d0, d1 = slopes[i], slopes[i + 1]
+        return self.values[i] + h * s * (d0 + s * ((3 * secant - 2 * d0 - d1) + s * (d0 + d1 - 2 * secant)))
+
+
+class FunctionProfile(Profile):
+    """Any function of X: $f(X) =$ `function(X, *parameters)`.
+
+    **Arguments:**
+    - `function`: takes the scalar X [m] and the parameters, returns a scalar; written with `jax.numpy`.
+    - `parameters`: any pytrees of arrays; derivatives with respect to them flow. An equinox module may be one.
+    """
+
+    function: Callable = eqx.field(static=True)
+    parameters: tuple
+
+    def __init__(self, function: Callable, *parameters: Any):
+        if not callable(function):
+            raise ValueError(f"FunctionProfile.function: got {function!r}, need a function of X")
+        self.function = function
+        self.parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf) if eqx.is_array_like(leaf) else leaf, parameters)
+
+    def __call__(self, X: Scalar, length: Scalar) -> Scalar:
+        return jnp.asarray(self.function(X, *self.parameters))
+
+
+def as_profile(name: str, value: Any, *, positive: bool = False) -> Profile:
+    """`value` as a profile: a `Profile` itself, a function of X, or a number."""
+    if isinstance(value, Taper):
+        numbers(f"{name} (Taper.base)", value.base, positive=positive)
+        numbers(f"{name} (Taper.tip)", value.tip, positive=positive)
+    if isinstance(value, Profile):
+        return value
+    if callable(value):
+        return FunctionProfile(value)
+    return Constant(numbers(name, value, positive=positive))

@@ -1,0 +1,90 @@
+"""The rod: a slender arm with its section, material, rest strain and base."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ._check import instance, numbers
+from ._types import Pose, Scalar
+from .component import Vector
+from .profile import FunctionProfile, Profile, as_profile
+from .section import Material, Section
+
+STRAINS = ("torsion", "bending_y", "bending_z", "elongation", "shear_y", "shear_z")
+"""Names of the six strains $(k_x, k_y, k_z, u_x, u_y, u_z)$ in order."""
+
+_STRAIGHT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
+
+
+class Rod(eqx.Module):
+    """A Cosserat rod, clamped at its base.
+
+    **Arguments:**
+    - `length`: $L$ [m].
+    - `section`, `material`: what makes its stiffness, see `Material.stiffness`.
+    - `rest_strain`: $\\xi^*(X) = (k^*, u^*)$: six profiles (numbers, `Profile` or functions of X), or one function of X
+      that returns six numbers. The default (0, 0, 0, 1, 0, 0) is straight.
+    - `base`: pose of the section at X = 0, shape (4, 4); the identity by default.
+    - `guide_radius`: threads are guided up to this radius [m] by discs wider than the section; by default they run
+      inside the section.
+    """
+
+    length: Scalar
+    section: Section
+    material: Material
+    rest_strain: tuple[Profile, ...] | FunctionProfile
+    base: Pose | None
+    guide_radius: Scalar | None
+
+    def __init__(
+        self,
+        length: Any,
+        section: Section,
+        material: Material,
+        *,
+        rest_strain: Sequence[Any] | Callable | None = None,
+        base: Any = None,
+        guide_radius: Any = None,
+    ):
+        self.length = numbers("Rod.length", length, positive=True)
+        self.section = instance("Rod.section", section, Section, "a section such as Circular, Annular, Rectangular or Elliptic")
+        self.material = instance("Rod.material", material, Material, "a Material")
+        self.rest_strain = _rest_strain(rest_strain)
+        self.base = None if base is None else numbers("Rod.base", base, (4, 4))
+        self.guide_radius = None if guide_radius is None else numbers("Rod.guide_radius", guide_radius, positive=True)
+
+    def rest(self, X: Scalar) -> Vector:
+        """Rest strain $\\xi^*$ at X [m], six scalars."""
+        if isinstance(self.rest_strain, FunctionProfile):
+            return tuple(jnp.asarray(x, X.dtype) for x in self.rest_strain.function(X, *self.rest_strain.parameters))
+        return tuple(profile(X, self.length) for profile in self.rest_strain)
+
+    def stiffness(self, X: Scalar) -> Vector:
+        """Diagonal of $\\Sigma$ at X [m], six scalars [N m^2] and [N]."""
+        return self.material.stiffness(self.section, X, self.length)
+
+    def clearance(self, y: Scalar, z: Scalar, X: Scalar) -> Array:
+        """How far (y, z) lies inside what guides threads at X: positive inside [m]."""
+        inside = self.section.clearance(y, z, X, self.length)
+        return inside if self.guide_radius is None else jnp.maximum(inside, self.guide_radius - jnp.sqrt(y**2 + z**2))
+
+    @property
+    def breakpoints(self) -> tuple[Scalar, ...]:
+        """Abscissas [m] where a derivative of a size or of the rest strain jumps."""
+        rest = () if isinstance(self.rest_strain, FunctionProfile) else self.rest_strain
+        return tuple(point for profile in (*self.section.sizes.values(), *rest) for point in profile.breakpoints)
+
+
+def _rest_strain(value: Any) -> tuple[Profile, ...] | FunctionProfile:
+    if value is None:
+        value = _STRAIGHT
+    if isinstance(value, FunctionProfile):
+        return value
+    if callable(value):
+        return FunctionProfile(value)
+    if isinstance(value, str) or len(value) != 6:
+        raise ValueError(f"Rod.rest_strain: got {value!r}, need six profiles in the order {', '.join(STRAINS)}, or a function of X")
+    return tuple(as_profile(f"Rod.rest_strain ({name})", x) for name, x in zip(STRAINS, value, strict=True))

@@ -1,0 +1,222 @@
+r"""Cross-sections and materials: what makes the stiffness $\Sigma = \mathrm{diag}(G J_x, E J_y, E J_z, E A, \kappa_y G A, \kappa_z G A)$.
+
+The y and z axes lie in the section, x along the arm. Sizes are profiles: a number, a `Profile` or a function of X.
+"""
+
+import math
+from abc import abstractmethod
+from typing import Any, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ._check import choice, numbers
+from ._types import Scalar
+from .component import Vector
+from .profile import Profile, as_profile
+
+Torsion = Literal["saint_venant", "polar"]
+
+
+class Geometry(eqx.Module):
+    """Area [m^2], second moments about y and z and torsion constant [m^4] of one cross-section."""
+
+    area: Scalar
+    moment_y: Scalar
+    moment_z: Scalar
+    torsion: Scalar
+
+
+class Section(eqx.Module):
+    """A cross-section whose sizes may vary along the arm.
+
+    **Shared arguments:**
+    - `torsion`: `"saint_venant"` takes the torsion constant of the shape, `"polar"` the polar moment $J_y + J_z$
+      (the paper's choice). Both agree for circular and annular sections.
+    - `shear_correction`: factors $(\\kappa_y, \\kappa_z)$ of the shear stiffness [-], one number for both; 1 in the paper.
+    """
+
+    torsion: eqx.AbstractVar[Torsion]
+    shear_correction: eqx.AbstractVar[Float[Array, "2"]]
+
+    @abstractmethod
+    def geometry(self, X: Scalar, length: Scalar) -> Geometry:
+        """Area, second moments and torsion constant at X [m]."""
+
+    @abstractmethod
+    def clearance(self, y: Scalar, z: Scalar, X: Scalar, length: Scalar) -> Scalar:
+        """How far (y, z) lies inside the outer wall at X: positive inside, negative outside [m]."""
+
+    @property
+    @abstractmethod
+    def sizes(self) -> dict[str, Profile]:
+        """The size profiles by name."""
+
+
+def _size(section: str, name: str, value: Any) -> Profile:
+    return as_profile(f"{section}.{name}", value, positive=True)
+
+
+def _options(torsion: Torsion, shear_correction: Any) -> tuple[Torsion, Float[Array, "2"]]:
+    factor = numbers("shear_correction", shear_correction, None, positive=True)
+    if factor.shape not in ((), (2,)):
+        raise ValueError(f"shear_correction: got shape {factor.shape}, need one number or two")
+    return choice("torsion", torsion, ("saint_venant", "polar")), jnp.broadcast_to(factor, (2,))
+
+
+class Circular(Section):
+    """Solid disc: $A = \\pi r^2$, $J_y = J_z = \\pi r^4 / 4$, $J_x = \\pi r^4 / 2$."""
+
+    radius: Profile
+    torsion: Torsion = eqx.field(static=True)
+    shear_correction: Float[Array, "2"]
+
+    def __init__(self, radius: Any, *, shear_correction: Any = 1.0):
+        self.radius = _size("Circular", "radius", radius)
+        self.torsion, self.shear_correction = _options("saint_venant", shear_correction)
+
+    def geometry(self, X: Scalar, length: Scalar) -> Geometry:
+        r = self.radius(X, length)
+        moment = math.pi / 4 * r**4
+        return Geometry(math.pi * r**2, moment, moment, 2 * moment)
+
+    def clearance(self, y: Scalar, z: Scalar, X: Scalar, length: Scalar) -> Scalar:
+        return self.radius(X, length) - jnp.sqrt(y**2 + z**2)
+
+    @property
+    def sizes(self) -> dict[str, Profile]:
+        return {"radius": self.radius}
+
+
+class Annular(Section):
+    """Tube of radii $r < R$: $A = \\pi (R^2 - r^2)$, $J_y = J_z = \\pi (R^4 - r^4) / 4$, $J_x = 2 J_y$."""
+
+    outer: Profile
+    inner: Profile
+    torsion: Torsion = eqx.field(static=True)
+    shear_correction: Float[Array, "2"]
+
+    def __init__(self, outer: Any, inner: Any, *, shear_correction: Any = 1.0):
+        self.outer = _size("Annular", "outer", outer)
+        self.inner = _size("Annular", "inner", inner)
+        self.torsion, self.shear_correction = _options("saint_venant", shear_correction)
+
+    def geometry(self, X: Scalar, length: Scalar) -> Geometry:
+        outer, inner = self.outer(X, length), self.inner(X, length)
+        moment = math.pi / 4 * (outer**4 - inner**4)
+        return Geometry(math.pi * (outer**2 - inner**2), moment, moment, 2 * moment)
+
+    def clearance(self, y: Scalar, z: Scalar, X: Scalar, length: Scalar) -> Scalar:
+        return self.outer(X, length) - jnp.sqrt(y**2 + z**2)
+
+    @property
+    def sizes(self) -> dict[str, Profile]:
+        return {"outer": self.outer, "inner": self.inner}
+
+
+class Rectangular(Section):
+    r"""Rectangle of width $w$ along y and height $h$ along z: $J_y = w h^3 / 12$, $J_z = h w^3 / 12$.
+
+    The Saint-Venant constant with $a \ge b$ the sides is $\frac{a b^3}{3} \left(1 - \frac{192}{\pi^5} \frac b a
+    \sum_{n\,odd} \frac{1}{n^5} \tanh\frac{n \pi a}{2 b}\right)$; the part of the sum with tanh = 1 is exact, so nine terms
+    reach rounding. **Source:** Timoshenko & Goodier, Theory of Elasticity, art. 109.
+    """
+
+    width: Profile
+    height: Profile
+    torsion: Torsion = eqx.field(static=True)
+    shear_correction: Float[Array, "2"]
+
+    def __init__(self, width: Any, height: Any, *, torsion: Torsion = "saint_venant", shear_correction: Any = 1.0):
+        self.width = _size("Rectangular", "width", width)
+        self.height = _size("Rectangular", "height", height)
+        self.torsion, self.shear_correction = _options(torsion, shear_correction)
+
+    def geometry(self, X: Scalar, length: Scalar) -> Geometry:
+        w, h = self.width(X, length), self.height(X, length)
+        moment_y, moment_z = w * h**3 / 12, h * w**3 / 12
+        torsion = moment_y + moment_z if self.torsion == "polar" else _rectangle_torsion(w, h)
+        return Geometry(w * h, moment_y, moment_z, torsion)
+
+    def clearance(self, y: Scalar, z: Scalar, X: Scalar, length: Scalar) -> Scalar:
+        return jnp.minimum(self.width(X, length) / 2 - jnp.abs(y), self.height(X, length) / 2 - jnp.abs(z))
+
+    @property
+    def sizes(self) -> dict[str, Profile]:
+        return {"width": self.width, "height": self.height}
+
+
+def _rectangle_torsion(w: Scalar, h: Scalar) -> Scalar:
+    a, b = jnp.maximum(w, h), jnp.minimum(w, h)
+    total = jnp.full_like(a, 31 / 32 * 1.0369277551433699)  # the sum of 1 / n^5 over odd n, 31/32 zeta(5)
+    for n in range(1, 19, 2):
+        decay = jnp.exp(-n * math.pi * a / b)
+        total = total - 2 * decay / (1 + decay) / n**5  # 1 - tanh(x/2) = 2 e^-x / (1 + e^-x)
+    return a * b**3 / 3 * (1 - 192 / math.pi**5 * (b / a) * total)
+
+
+class Elliptic(Section):
+    r"""Ellipse of half axes $a$ along y and $b$ along z.
+
+    $A = \pi a b$, $J_y = \frac\pi4 a b^3$, $J_z = \frac\pi4 a^3 b$, Saint-Venant $J_x = \frac{\pi a^3 b^3}{a^2 + b^2}$.
+    """
+
+    half_y: Profile
+    half_z: Profile
+    torsion: Torsion = eqx.field(static=True)
+    shear_correction: Float[Array, "2"]
+
+    def __init__(self, half_y: Any, half_z: Any, *, torsion: Torsion = "saint_venant", shear_correction: Any = 1.0):
+        self.half_y = _size("Elliptic", "half_y", half_y)
+        self.half_z = _size("Elliptic", "half_z", half_z)
+        self.torsion, self.shear_correction = _options(torsion, shear_correction)
+
+    def geometry(self, X: Scalar, length: Scalar) -> Geometry:
+        a, b = self.half_y(X, length), self.half_z(X, length)
+        moment_y, moment_z = math.pi / 4 * a * b**3, math.pi / 4 * a**3 * b
+        torsion = moment_y + moment_z if self.torsion == "polar" else math.pi * a**3 * b**3 / (a**2 + b**2)
+        return Geometry(math.pi * a * b, moment_y, moment_z, torsion)
+
+    def clearance(self, y: Scalar, z: Scalar, X: Scalar, length: Scalar) -> Scalar:
+        a, b = self.half_y(X, length), self.half_z(X, length)
+        return (1 - jnp.sqrt((y / a) ** 2 + (z / b) ** 2)) * jnp.minimum(a, b)
+
+    @property
+    def sizes(self) -> dict[str, Profile]:
+        return {"half_y": self.half_y, "half_z": self.half_z}
+
+
+class Material(eqx.Module):
+    """Linear elastic material.
+
+    **Arguments:**
+    - `young`: Young's modulus $E$ [Pa].
+    - `shear` or `poisson`: the shear modulus $G$ [Pa], or Poisson's ratio $\\nu$ [-] for $G = E / (2 + 2\\nu)$; one of the two.
+    """
+
+    young: Scalar
+    shear: Scalar | None
+    poisson: Scalar | None
+
+    def __init__(self, young: Any, shear: Any = None, poisson: Any = None):
+        if (shear is None) == (poisson is None):
+            raise ValueError(f"Material: got shear={shear!r} and poisson={poisson!r}, need one of the two")
+        self.young = numbers("Material.young", young, positive=True)
+        self.shear = None if shear is None else numbers("Material.shear", shear, positive=True)
+        self.poisson = None if poisson is None else numbers("Material.poisson", poisson)
+
+    @property
+    def shear_modulus(self) -> Scalar:
+        """Shear modulus $G$ [Pa]."""
+        if self.shear is not None:
+            return self.shear
+        assert self.poisson is not None
+        return self.young / (2 + 2 * self.poisson)
+
+    def stiffness(self, section: Section, X: Scalar, length: Scalar) -> Vector:
+        """Diagonal of $\\Sigma(X)$, six scalars [N m^2] and [N]."""
+        shape, E, G = section.geometry(X, length), self.young, self.shear_modulus
+        angular = (G * shape.torsion, E * shape.moment_y, E * shape.moment_z)
+        shear_y, shear_z = (kappa * G * shape.area for kappa in section.shear_correction)
+        return (*angular, E * shape.area, shear_y, shear_z)

@@ -1,0 +1,68 @@
+"""The one entry: a scene and its inputs in, an equilibrium out."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ._check import instance, is_traced
+from .equilibrium import Equilibrium
+from .model import Model, Outcome, Status
+from .scene import Scene
+from .strain_dependent import StrainDependent
+
+
+class SolveError(RuntimeError):
+    """Raised by `solve(..., throw=True)` when no equilibrium was found; its text is the status in words."""
+
+
+def solve(scene: Scene, inputs: Any, *, model: Model | None = None, throw: bool = False) -> Equilibrium:
+    r"""Static equilibrium of a scene: a stationary point of
+
+    $\Pi(\xi) = \int_0^L \frac12 (\xi - \xi^*)^T \Sigma (\xi - \xi^*) \, dX - \sum_i \tau_i l_i(\xi)$,
+
+    with $l_i$ the length of thread i. One scene at a time; batch with `jax.vmap`. Derivatives of everything that comes
+    back, with respect to every number of the scene and to the inputs, are implicit and go in forward and reverse mode.
+
+    **Arguments:**
+    - `scene`: rod and actuators.
+    - `inputs`: one number an actuator: tau [N] for a `Thread`, tension [N] for a `Tendon`, pressure [Pa] for a
+      `Chamber`. Their dtype is the precision of the whole computation.
+    - `model`: `StrainDependent()` by default, the exact one; `Prescribed(basis)`; `Continuum()`.
+    - `throw`: raise if the solve did not converge. Otherwise the status says so and the shape is NaN.
+
+    **Raises:** `ValueError` for a wrong number of inputs and, where their values are known, for NaN or a tension < 0.
+    `SolveError` with `throw=True`; under `jax.jit` the error equinox raises at run time.
+
+    **Source:** eq. (8)-(21) of Renda et al. 2020.
+    """
+    instance("scene", scene, Scene, "a Scene")
+    values = scene.check_inputs(inputs)
+    chosen = StrainDependent() if model is None else instance("model", model, Model, "StrainDependent(), Prescribed(basis) or Continuum()")
+    scene, chosen = (_astype(part, values.dtype) for part in (scene, chosen))
+    equilibrium = Equilibrium(scene, values, chosen, _solve(scene, values, chosen))
+    return _raise_if_failed(equilibrium) if throw else equilibrium
+
+
+def _astype(part: Any, dtype: Any) -> Any:
+    return jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, part)
+
+
+@eqx.filter_jit
+def _solve(scene: Scene, inputs: Float[Array, " inputs"], model: Model) -> Outcome:
+    finite, admitted = jnp.all(jnp.isfinite(inputs)), scene.admits(inputs)
+    state, status, steps = model.solve(scene, jnp.where(finite & admitted, inputs, 0.0))
+    status = jnp.where(admitted, status, Status.INADMISSIBLE)
+    return Outcome(state, jnp.where(finite, status, Status.NOT_FINITE).astype(jnp.int32), steps)
+
+
+def _raise_if_failed(equilibrium: Equilibrium) -> Equilibrium:
+    if not is_traced(equilibrium.status):
+        if not bool(equilibrium.converged):
+            raise SolveError(equilibrium.message)
+        return equilibrium
+    for status in list(Status)[1:]:
+        equilibrium = eqx.error_if(equilibrium, equilibrium.status == status, status.message)
+    return equilibrium
