@@ -23,10 +23,10 @@ def _refuse(name: str, value: Any, needed: str) -> ValueError:
     return ValueError(f"{name}: got {value!r}, need {needed}")
 
 
-def numbers(name: str, value: Any, shape: tuple[int, ...] | None = (), *, positive: bool = False, nonnegative: bool = False) -> Array:
-    """`value` as a floating-point array of `shape` (any shape for None), finite and of the wanted sign where it is known."""
-    kind = "a number" if shape == () else "numbers" if shape is None else f"numbers of shape {shape}"
-    needed = kind if not (positive or nonnegative) else f"{kind} {'> 0' if positive else '>= 0'}"
+def numbers(name: str, value: Any, shape: tuple[int, ...] | None = (), *, positive: bool = False, finite: bool = True) -> Array:
+    """`value` as a floating-point array of `shape` (any shape for None), finite and positive, as wanted, where it is known."""
+    kind = "a finite number" if shape == () else "finite numbers" if shape is None else f"finite numbers of shape {shape}"
+    needed = kind + (" > 0" if positive else "")
     if isinstance(value, str):
         raise _refuse(name, value, needed)
     try:
@@ -34,15 +34,13 @@ def numbers(name: str, value: Any, shape: tuple[int, ...] | None = (), *, positi
     except (TypeError, ValueError):
         raise _refuse(name, value, needed) from None
     if jnp.issubdtype(array.dtype, jnp.complexfloating) or array.dtype == bool:
-        raise _refuse(name, value, f"real {needed}")
+        raise _refuse(name, value, needed)
     array = array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(float)
     if shape is not None and array.shape != shape:
         raise ValueError(f"{name}: got shape {array.shape}, need {needed}")
     known = concrete(array)
     if known is not None:
-        if not np.all(np.isfinite(known)):
-            raise _refuse(name, value, f"finite {needed}")
-        if (positive and not np.all(known > 0)) or (nonnegative and not np.all(known >= 0)):
+        if (finite and not np.all(np.isfinite(known))) or (positive and not np.all(known > 0)):
             raise _refuse(name, value, needed)
     return array
 

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ._check import count, instance, numbers
+from ._check import concrete, count, instance, numbers
 from ._types import Scalar
-from .profile import FunctionProfile
+from .profile import FunctionOfX
 from .rod import STRAINS
 
 
@@ -119,9 +119,10 @@ class PiecewiseConstant(Family):
     def __init__(self, sections: Any):
         if isinstance(sections, int):
             sections = np.arange(1, count("PiecewiseConstant.sections", sections)) / sections
-        self.ends = numbers("PiecewiseConstant.sections", np.asarray(sections, float) if isinstance(sections, list) else sections, None)
-        if self.ends.ndim != 1:
-            raise ValueError(f"PiecewiseConstant.sections: got shape {self.ends.shape}, need an integer or fractions in a row")
+        self.ends = numbers("PiecewiseConstant.sections", sections, None)
+        known = concrete(self.ends)
+        if self.ends.ndim != 1 or (known is not None and not np.all(np.diff(known, prepend=0.0, append=1.0) > 0)):
+            raise ValueError(f"PiecewiseConstant.sections: got {sections!r}, need an integer, or rising fractions between 0 and 1")
 
     @property
     def size(self) -> int:
@@ -138,11 +139,11 @@ class PiecewiseConstant(Family):
 class Functions(Family):
     """Any scalar functions: values = `function(X, *parameters)`, an array of `size` numbers, X in metres."""
 
-    function: FunctionProfile
+    function: FunctionOfX
     _size: int = eqx.field(static=True)
 
     def __init__(self, function: Callable, *parameters: Any, size: int):
-        self.function = FunctionProfile(function, *parameters)
+        self.function = FunctionOfX("Functions", function, *parameters)
         self._size = count("Functions.size", size)
 
     @property
@@ -150,7 +151,7 @@ class Functions(Family):
         return self._size
 
     def __call__(self, X: Scalar, length: Scalar) -> Float[Array, " size"]:
-        return self.function(X, length)
+        return self.function(X)
 
 
 class AbstractBasis(eqx.Module):
@@ -215,11 +216,11 @@ class Basis(AbstractBasis):
 class FunctionBasis(AbstractBasis):
     """Any matrix: $B_q(X) =$ `function(X, *parameters)`, shape (6, `size`), X in metres."""
 
-    function: FunctionProfile
+    function: FunctionOfX
     _size: int = eqx.field(static=True)
 
     def __init__(self, function: Callable, *parameters: Any, size: int):
-        self.function = FunctionProfile(function, *parameters)
+        self.function = FunctionOfX("FunctionBasis", function, *parameters)
         self._size = count("FunctionBasis.size", size)
 
     @property
@@ -227,4 +228,4 @@ class FunctionBasis(AbstractBasis):
         return self._size
 
     def matrix(self, X: Scalar, length: Scalar) -> Float[Array, "6 dofs"]:
-        return self.function(X, length)
+        return self.function(X)

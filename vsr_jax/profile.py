@@ -18,6 +18,29 @@ from ._check import concrete, numbers
 from ._types import Scalar
 
 
+class FunctionOfX(eqx.Module):
+    """A user's function of X with parameters that can be differentiated.
+
+    **Arguments:**
+    - `owner`: who asks for it, for error messages.
+    - `function`: takes the scalar X [m] and the parameters; written with `jax.numpy`.
+    - `parameters`: any pytrees of arrays; derivatives with respect to them flow. An equinox module may be one.
+    """
+
+    function: Callable = eqx.field(static=True)
+    parameters: tuple
+
+    def __init__(self, owner: str, function: Callable, *parameters: Any):
+        if not callable(function):
+            raise ValueError(f"{owner}.function: got {function!r}, need a function of X")
+        self.function = function
+        self.parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf) if eqx.is_array_like(leaf) else leaf, parameters)
+
+    def __call__(self, X: Scalar) -> Any:
+        """Whatever the function returns at X [m]."""
+        return self.function(X, *self.parameters)
+
+
 class Profile(eqx.Module):
     """A scalar function of X on an arm of a given length."""
 
@@ -123,24 +146,15 @@ class SplineProfile(Profile):
 
 
 class FunctionProfile(Profile):
-    """Any function of X: $f(X) =$ `function(X, *parameters)`.
+    """Any function of X: $f(X) =$ `function(X, *parameters)`, a scalar; see `FunctionOfX` for the arguments."""
 
-    **Arguments:**
-    - `function`: takes the scalar X [m] and the parameters, returns a scalar; written with `jax.numpy`.
-    - `parameters`: any pytrees of arrays; derivatives with respect to them flow. An equinox module may be one.
-    """
-
-    function: Callable = eqx.field(static=True)
-    parameters: tuple
+    function: FunctionOfX
 
     def __init__(self, function: Callable, *parameters: Any):
-        if not callable(function):
-            raise ValueError(f"FunctionProfile.function: got {function!r}, need a function of X")
-        self.function = function
-        self.parameters = jax.tree.map(lambda leaf: jnp.asarray(leaf) if eqx.is_array_like(leaf) else leaf, parameters)
+        self.function = FunctionOfX("FunctionProfile", function, *parameters)
 
     def __call__(self, X: Scalar, length: Scalar) -> Scalar:
-        return jnp.asarray(self.function(X, *self.parameters))
+        return jnp.asarray(self.function(X), X.dtype)
 
 
 def as_profile(name: str, value: Any, *, positive: bool = False) -> Profile:

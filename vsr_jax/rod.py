@@ -5,12 +5,13 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from ._check import instance, numbers
 from ._types import Pose, Scalar
 from .component import Vector
-from .profile import FunctionProfile, Profile, as_profile
+from .profile import FunctionOfX, Profile, as_profile
 from .section import Material, Section
 
 STRAINS = ("torsion", "bending_y", "bending_z", "elongation", "shear_y", "shear_z")
@@ -35,7 +36,7 @@ class Rod(eqx.Module):
     length: Scalar
     section: Section
     material: Material
-    rest_strain: tuple[Profile, ...] | FunctionProfile
+    rest_strain: tuple[Profile, ...] | FunctionOfX
     base: Pose | None
     guide_radius: Scalar | None
 
@@ -58,8 +59,8 @@ class Rod(eqx.Module):
 
     def rest(self, X: Scalar) -> Vector:
         """Rest strain $\\xi^*$ at X [m], six scalars."""
-        if isinstance(self.rest_strain, FunctionProfile):
-            return tuple(jnp.asarray(x, X.dtype) for x in self.rest_strain.function(X, *self.rest_strain.parameters))
+        if isinstance(self.rest_strain, FunctionOfX):
+            return tuple(jnp.asarray(x, X.dtype) for x in self.rest_strain(X))
         return tuple(profile(X, self.length) for profile in self.rest_strain)
 
     def stiffness(self, X: Scalar) -> Vector:
@@ -74,17 +75,17 @@ class Rod(eqx.Module):
     @property
     def breakpoints(self) -> tuple[Scalar, ...]:
         """Abscissas [m] where a derivative of a size or of the rest strain jumps."""
-        rest = () if isinstance(self.rest_strain, FunctionProfile) else self.rest_strain
+        rest = () if isinstance(self.rest_strain, FunctionOfX) else self.rest_strain
         return tuple(point for profile in (*self.section.sizes.values(), *rest) for point in profile.breakpoints)
 
 
-def _rest_strain(value: Any) -> tuple[Profile, ...] | FunctionProfile:
+def _rest_strain(value: Any) -> tuple[Profile, ...] | FunctionOfX:
     if value is None:
         value = _STRAIGHT
-    if isinstance(value, FunctionProfile):
+    if isinstance(value, FunctionOfX):
         return value
     if callable(value):
-        return FunctionProfile(value)
-    if isinstance(value, str) or len(value) != 6:
+        return FunctionOfX("Rod.rest_strain", value)
+    if isinstance(value, str) or not isinstance(value, Sequence | np.ndarray | Array) or len(value) != 6:
         raise ValueError(f"Rod.rest_strain: got {value!r}, need six profiles in the order {', '.join(STRAINS)}, or a function of X")
     return tuple(as_profile(f"Rod.rest_strain ({name})", x) for name, x in zip(STRAINS, value, strict=True))

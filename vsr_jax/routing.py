@@ -16,7 +16,7 @@ from jaxtyping import Array
 
 from ._check import choice, numbers
 from ._types import Scalar
-from .profile import FunctionProfile, PolynomialProfile, SplineProfile
+from .profile import FunctionOfX, PolynomialProfile, SplineProfile
 
 
 class Path(NamedTuple):
@@ -155,14 +155,14 @@ class Function(Routing):
 
     **Arguments:**
     - `function`: takes the scalar X [m] and the parameters, returns the pair (d_y, d_z) [m].
-    - `parameters`: any pytrees of arrays; derivatives with respect to them flow. An equinox module may be one.
+    - `parameters`: as for `FunctionOfX`.
     """
 
-    function: FunctionProfile
+    function: FunctionOfX
 
     def __init__(self, function: Callable, *parameters: Any):
-        self.function = FunctionProfile(function, *parameters)
+        self.function = FunctionOfX("Function", function, *parameters)
 
     def __call__(self, X: Scalar) -> tuple[Scalar, Scalar]:
-        y, z = self.function.function(X, *self.function.parameters)
+        y, z = self.function(X)
         return jnp.asarray(y, X.dtype), jnp.asarray(z, X.dtype)

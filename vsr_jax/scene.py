@@ -85,7 +85,7 @@ class Scene(eqx.Module):
         **Raises:** `ValueError` for a wrong number of inputs and, while their values are known, for NaN, infinities and
         values outside an actuator's range.
         """
-        array = numbers("inputs", inputs, None) if isinstance(inputs, str) else _as_floats(inputs)
+        array = numbers("inputs", inputs, None, finite=False)
         kinds = ", ".join(type(a).__name__ for a in self.actuators)
         if array.shape != (len(self.actuators),):
             raise ValueError(
@@ -121,13 +121,6 @@ class Scene(eqx.Module):
                     f"Scene.actuators[{i}].routing: the thread lies {-values[j]:.3g} m outside the section at X = {X[j]:g} m; "
                     "need a path inside the section (or give the rod a guide_radius)"
                 )
-
-
-def _as_floats(inputs: Any) -> Array:
-    if isinstance(inputs, (list, tuple)) and any(isinstance(x, str) for x in inputs):
-        raise ValueError(f"inputs: got {inputs!r}, need numbers")
-    array = jnp.asarray(inputs)
-    return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(float)
 
 
 @eqx.filter_jit

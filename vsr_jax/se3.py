@@ -6,7 +6,9 @@ maps on tuples of component arrays (see `component`), for the kernels.
 """
 
 import math
+from functools import partial
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -18,30 +20,38 @@ _TERMS = 14
 _SWITCH = 4.0  # of theta^2
 
 
-def _entire(x: Array, first: int) -> Array:
-    """Sum over j of $(-x)^j / (2j + n)!$ by Horner's rule; to rounding for x < 4, its derivatives included."""
+def exp_coefficients(x: Array) -> tuple[Array, Array, Array]:
+    r"""Coefficients $\sin\theta/\theta$, $(1-\cos\theta)/\theta^2$, $(\theta-\sin\theta)/\theta^3$ as entire functions of $x = \theta^2$.
+
+    A Taylor branch below $\theta = 2$ and the closed form above, each evaluated at a harmless argument where the other
+    one is taken, so that values and derivatives of any order are finite and exact to rounding at every angle.
+    """
+    near = x < _SWITCH
+    below, above = jnp.where(near, x, 0.0), jnp.where(near, _SWITCH, x)
+    theta = jnp.sqrt(above)
+    sine, half = jnp.sin(theta), jnp.sin(0.5 * theta)
+    closed = (sine / theta, 2.0 * half * half / above, (theta - sine) / (above * theta))
+    series = (_stumpff(below, n) for n in (1, 2, 3))
+    a, b, c3 = (jnp.where(near, s, f) for s, f in zip(series, closed, strict=True))
+    return a, b, c3
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(1,))
+def _stumpff(x: Array, n: int) -> Array:
+    r"""Series of the Stumpff function $c_n(x) = \sum_j (-x)^j / (2 j + n)!$ for $0 \le x < 4$.
+
+    Its derivative is $c_n' = -\frac12 (c_{n+1} - n\,c_{n+2})$: two more series instead of a differentiated one.
+    """
     value = jnp.zeros_like(x)
     for j in reversed(range(_TERMS)):
-        value = 1.0 / math.factorial(2 * j + first) - x * value
+        value = 1.0 / math.factorial(2 * j + n) - x * value
     return value
 
 
-def exp_coefficients(theta_squared: Array) -> tuple[Array, Array, Array]:
-    r"""Coefficients $\sin\theta/\theta$, $(1-\cos\theta)/\theta^2$, $(\theta-\sin\theta)/\theta^3$ as entire functions of $\theta^2$.
-
-    A Taylor branch below $\theta = 2$ and the closed form above, each evaluated at a harmless argument where the other
-    one is taken, so that values and derivatives of any order stay finite and exact at $\theta = 0$.
-    """
-    near = theta_squared < _SWITCH
-    x = jnp.where(near, theta_squared, 0.0)
-    far = jnp.where(near, _SWITCH, theta_squared)
-    theta = jnp.sqrt(far)
-    half = jnp.sin(0.5 * theta)
-    sine = jnp.sin(theta)
-    a = jnp.where(near, _entire(x, 1), sine / theta)
-    b = jnp.where(near, _entire(x, 2), 2.0 * half * half / far)
-    c3 = jnp.where(near, _entire(x, 3), (theta - sine) / (far * theta))
-    return a, b, c3
+@_stumpff.defjvp
+def _stumpff_jvp(n: int, primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    (x,), (dx,) = primals, tangents
+    return _stumpff(x, n), -0.5 * (_stumpff(x, n + 1) - n * _stumpff(x, n + 2)) * dx
 
 
 def exp_components(omega: Vector) -> tuple[Matrix, Vector]:
@@ -95,7 +105,7 @@ def vee(matrix: Pose) -> Twist:
     return jnp.concatenate([angular, m[:3, 3]])
 
 
-def pose(rotation: Matrix, position: Vector) -> Pose:
+def pose(rotation: Matrix, position: Vector) -> Float[Array, "*batch 4 4"]:
     """Matrix $g$ of shape (..., 4, 4) from the components of $R$ and $r$."""
     zero = jnp.zeros_like(position[0])
     rows = [(*row, x) for row, x in zip(rotation, position, strict=True)]

@@ -48,6 +48,10 @@ class Section(eqx.Module):
     def clearance(self, y: Scalar, z: Scalar, X: Scalar, length: Scalar) -> Scalar:
         """How far (y, z) lies inside the outer wall at X: positive inside, negative outside [m]."""
 
+    @abstractmethod
+    def outline(self, angle: Array, X: Scalar, length: Scalar) -> tuple[Array, Array]:
+        """Points (y, z) [m] of the outer wall at X, once round as `angle` [rad] goes from 0 (on the y axis) to 2 pi."""
+
     @property
     @abstractmethod
     def sizes(self) -> dict[str, Profile]:
@@ -84,6 +88,10 @@ class Circular(Section):
     def clearance(self, y: Scalar, z: Scalar, X: Scalar, length: Scalar) -> Scalar:
         return self.radius(X, length) - jnp.sqrt(y**2 + z**2)
 
+    def outline(self, angle: Array, X: Scalar, length: Scalar) -> tuple[Array, Array]:
+        r = self.radius(X, length)
+        return r * jnp.cos(angle), r * jnp.sin(angle)
+
     @property
     def sizes(self) -> dict[str, Profile]:
         return {"radius": self.radius}
@@ -109,6 +117,10 @@ class Annular(Section):
 
     def clearance(self, y: Scalar, z: Scalar, X: Scalar, length: Scalar) -> Scalar:
         return self.outer(X, length) - jnp.sqrt(y**2 + z**2)
+
+    def outline(self, angle: Array, X: Scalar, length: Scalar) -> tuple[Array, Array]:
+        r = self.outer(X, length)
+        return r * jnp.cos(angle), r * jnp.sin(angle)
 
     @property
     def sizes(self) -> dict[str, Profile]:
@@ -141,6 +153,11 @@ class Rectangular(Section):
 
     def clearance(self, y: Scalar, z: Scalar, X: Scalar, length: Scalar) -> Scalar:
         return jnp.minimum(self.width(X, length) / 2 - jnp.abs(y), self.height(X, length) / 2 - jnp.abs(z))
+
+    def outline(self, angle: Array, X: Scalar, length: Scalar) -> tuple[Array, Array]:
+        cosine, sine = jnp.cos(angle), jnp.sin(angle)
+        square = jnp.maximum(jnp.abs(cosine), jnp.abs(sine))
+        return self.width(X, length) / 2 * cosine / square, self.height(X, length) / 2 * sine / square
 
     @property
     def sizes(self) -> dict[str, Profile]:
@@ -181,6 +198,9 @@ class Elliptic(Section):
     def clearance(self, y: Scalar, z: Scalar, X: Scalar, length: Scalar) -> Scalar:
         a, b = self.half_y(X, length), self.half_z(X, length)
         return (1 - jnp.sqrt((y / a) ** 2 + (z / b) ** 2)) * jnp.minimum(a, b)
+
+    def outline(self, angle: Array, X: Scalar, length: Scalar) -> tuple[Array, Array]:
+        return self.half_y(X, length) * jnp.cos(angle), self.half_z(X, length) * jnp.sin(angle)
 
     @property
     def sizes(self) -> dict[str, Profile]:

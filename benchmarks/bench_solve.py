@@ -1,0 +1,128 @@
+"""Time of a solve: compile, single, 1,024 in a batch and the batched gradient, in float32 and float64, in one run.
+
+    python benchmarks/bench_solve.py [--json FILE] [--cold]
+
+The batch draws tensions uniformly from [-15, 0] N. "gradient" is the derivative of a tip coordinate, summed over the
+batch, with respect to every number of every routing. `--cold` adds the time from a cold process to the first tip of B1.
+"""
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import vsr_jax as vsr
+from vsr_jax import paper
+
+BATCH = 1024
+REPEATS = 15
+COLD = """
+import time; start = time.perf_counter()
+import jax; jax.config.update("jax_enable_x64", True)
+import vsr_jax as vsr
+imported = time.perf_counter()
+arm = vsr.Rod(0.75, vsr.Circular(0.01), vsr.Material(5.93e5, shear=2.0e5))
+scene = vsr.Scene(arm, [vsr.Thread(vsr.Helix(0.005, 1.529))])
+built = time.perf_counter()
+vsr.solve(scene, [-15.0]).tip.block_until_ready()
+print(imported - start, built - imported, time.perf_counter() - built)
+"""
+
+
+def timed(function: Callable, *args: Any) -> dict[str, float]:
+    """Compile time [s], and median and spread (10 to 90 %) of warm calls [us]."""
+    compiled = jax.jit(function)
+    start = time.perf_counter()
+    jax.block_until_ready(compiled(*args))
+    first = time.perf_counter() - start
+    samples = []
+    for _ in range(REPEATS):
+        start = time.perf_counter()
+        jax.block_until_ready(compiled(*args))
+        samples.append(1e6 * (time.perf_counter() - start))
+    low, high = np.quantile(samples, [0.1, 0.9])
+    median = statistics.median(samples)
+    return {"compile_s": first - 1e-6 * median, "median_us": median, "low_us": float(low), "high_us": float(high)}
+
+
+def measure(name: str, scene: vsr.Scene, model: vsr.StrainDependent, dtype: str) -> dict[str, Any]:
+    """Row of the table for one scene in one precision."""
+    scene = scene.astype(dtype)
+    threads = len(scene.actuators)
+    taus = jnp.asarray(np.random.default_rng(0).uniform(-15, 0, (BATCH, threads)), dtype)
+
+    def tip(scene: vsr.Scene, tau: jax.Array) -> jax.Array:
+        return vsr.solve(scene, tau, model=model).tip[:3, 3]
+
+    def tips(scene: vsr.Scene, taus: jax.Array) -> jax.Array:
+        return jax.vmap(tip, in_axes=(None, 0))(scene, taus)
+
+    def strains(scene: vsr.Scene, taus: jax.Array) -> Any:
+        return jax.vmap(lambda tau: model.solve(scene, tau).state)(taus)
+
+    def height(actuators: Any, scene: vsr.Scene, taus: jax.Array) -> jax.Array:
+        return jnp.sum(tips(eqx.tree_at(lambda s: s.actuators, scene, actuators), taus)[:, 2])
+
+    nodes = model.steps * model.order // 2
+    row = {"scene": name, "threads": threads, "steps": model.steps, "order": model.order, "nodes": nodes, "dtype": dtype}
+    row["single"] = timed(tip, scene, taus[0])
+    row["strains only"] = timed(strains, scene, taus)
+    row["batch"] = timed(tips, scene, taus)
+    row["gradient"] = timed(jax.grad(height), scene.actuators, scene, taus)
+    row["gradient_over_batch"] = row["gradient"]["median_us"] / row["batch"]["median_us"]
+    return row
+
+
+def cold_start(runs: int = 3) -> dict[str, float]:
+    """Medians of import, build and solve to the first tip of B1, each run in a process of its own [s]."""
+    rows = [subprocess.run([sys.executable, "-c", COLD], capture_output=True, text=True, check=True).stdout.split() for _ in range(runs)]
+    parts = np.median(np.array(rows, float), axis=0)
+    return dict(zip(("import_s", "build_s", "solve_s", "total_s"), [*map(float, parts), float(parts.sum())], strict=True))
+
+
+def cell(entry: dict[str, float], per: int = 1) -> str:
+    """Median and spread per shape, and compile time, as text."""
+    low, mid, high = (entry[k] / per for k in ("low_us", "median_us", "high_us"))
+    return f"{mid:.1f} ({low:.1f}-{high:.1f}), {entry['compile_s']:.1f} s"
+
+
+def main() -> None:
+    """Run the benchmark and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path, help="write the figures here too")
+    parser.add_argument("--cold", action="store_true", help="measure the cold start as well")
+    options = parser.parse_args()
+    report: dict[str, Any] = {"machine": f"{platform.machine()}, {os.cpu_count()} cores, {jax.devices()[0].device_kind}", "jax": jax.__version__}
+    if options.cold:
+        report["cold"] = cold_start()
+        print("first answer from a cold process:", ", ".join(f"{k} {v:.2f}" for k, v in report["cold"].items()))
+    jax.config.update("jax_enable_x64", True)
+    jobs = [("A3, three threads", "A3", vsr.StrainDependent(32, 4)), ("B1, one helix", "B1", vsr.StrainDependent(16, 6))]
+    print(f"{report['machine']}, jax {report['jax']}; us a shape: median (10 %-90 %), compile time")
+    print("| scene | nodes | dtype | single | strains, 1,024 | tips, 1,024 | gradient, 1,024 | gradient / tips |\n|---|---|---|---|---|---|---|---|")
+    report["rows"] = []
+    for name, case, model in jobs:
+        for dtype in ("float64", "float32"):
+            row = measure(name, paper.scene(case), model, dtype)
+            report["rows"].append(row)
+            cells = [cell(row["single"]), *(cell(row[k], BATCH) for k in ("strains only", "batch", "gradient"))]
+            print(f"| {name} | {row['nodes']} | {dtype} | {' | '.join(cells)} | {row['gradient_over_batch']:.2f} |", flush=True)
+    if options.json:
+        options.json.parent.mkdir(parents=True, exist_ok=True)
+        options.json.write_text(json.dumps(report, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

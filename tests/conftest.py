@@ -1,0 +1,38 @@
+"""Shared by all tests: double precision on, shapes checked at run time, tolerances by precision, and the paper's helix."""
+
+import jaxtyping
+
+with jaxtyping.install_import_hook("vsr_jax", "beartype.beartype"):
+    import vsr_jax  # noqa: F401
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+jax.config.update("jax_enable_x64", True)
+
+from vsr_jax import paper  # noqa: E402
+
+
+def epsilon(dtype) -> float:
+    """Machine epsilon: tolerances are written as multiples of it."""
+    return float(jnp.finfo(dtype).eps)
+
+
+@pytest.fixture(params=["float32", "float64"])
+def dtype(request):
+    return jnp.dtype(request.param)
+
+
+@pytest.fixture(scope="session")
+def helix():
+    """Scene B1 of the paper: one helical thread."""
+    return paper.scene("B1")
+
+
+@pytest.fixture
+def unchecked():
+    """What a user meets: without the run-time type checks of the tests, bad arguments reach the package's own checks."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)

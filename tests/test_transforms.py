@@ -1,0 +1,123 @@
+"""jit, vmap and grad through every result of every model: forward = reverse = finite differences."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vsr_jax as vsr
+from vsr_jax import paper
+
+MODELS = {
+    "strain-dependent": vsr.StrainDependent(24),
+    "prescribed": vsr.Prescribed(vsr.Basis.uniform(vsr.Legendre(3)), points=12, steps=24),
+    "continuum": vsr.Continuum(rtol=1e-10, atol=1e-12, derivative=vsr.StrainDependent(48)),
+}
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A hollow cone, bent at rest, on a turned base, with a helical chamber: each number of it is differentiated."""
+    arm = vsr.Rod(
+        0.6,
+        vsr.Annular(vsr.Taper(0.012, 0.010), 0.003),
+        vsr.Material(6e5, poisson=0.45),
+        rest_strain=(0.0, vsr.Taper(0.2, 1.0), 0.5, 1.0, 0.0, 0.0),
+        base=vsr.se3.exp(jnp.array([0.1, 0.2, 0.3, 0.0, 0.0, 0.1])),
+    )
+    return vsr.Scene(arm, [vsr.Chamber(vsr.Helix(0.005, pitch=0.5, phase=0.2), area=2e-5)])
+
+
+INPUTS = jnp.array([-2e5])
+
+
+def results(scene, inputs, model):
+    """The tip and, for the exact model, every other result."""
+    eq = vsr.solve(scene, inputs, model=model)
+    if not isinstance(model, vsr.StrainDependent):
+        return eq.tip[:3].ravel()
+    return jnp.concatenate([eq.tip[:3].ravel(), eq.pose(0.31)[:3].ravel(), eq.strain(0.2), eq.lengths, eq.q])
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_derivatives_by_every_number_agree(name, scene):
+    model = MODELS[name]
+    numbers, rebuild = jax.flatten_util.ravel_pytree((scene, INPUTS))
+
+    def flat(x):
+        return results(*rebuild(x), model)
+
+    value, push = jax.jit(flat), jax.jit(lambda x, v: jax.jvp(flat, (x,), (v,))[1])
+    pull = jax.jit(lambda x, w: jax.vjp(flat, x)[1](w)[0])
+    cotangent = jnp.asarray(np.random.default_rng(0).normal(size=value(numbers).size))
+    reverse = pull(numbers, cotangent)
+    assert numbers.size > 30
+    accuracy = 2e-5 if name == "continuum" else 2e-7
+    for i, x in enumerate(np.asarray(numbers)):
+        unit = jnp.zeros_like(numbers).at[i].set(1.0)
+        forward, h = push(numbers, unit), 1e-4 * abs(x) or 1e-6
+        scale = np.abs(forward).max() + 1e-9
+        difference = (8 * (value(numbers + h * unit) - value(numbers - h * unit)) - value(numbers + 2 * h * unit) + value(numbers - 2 * h * unit)) / (12 * h)
+        np.testing.assert_allclose(forward / scale, difference / scale, atol=accuracy, err_msg=f"number {i}, value {x}")
+        np.testing.assert_allclose(reverse[i] / scale, jnp.dot(cotangent, forward) / scale, atol=1e-9, err_msg=f"number {i}, value {x}")
+
+
+def test_second_derivatives(helix):
+    model = MODELS["prescribed"]  # those of the balance have a test of their own
+
+    def height(tau):
+        return vsr.solve(helix, tau[None], model=model).tip[2, 3]
+
+    at, h = jnp.asarray(-9.0), 1e-2
+    values = [float(height(at + i * h)) for i in (-2, -1, 0, 1, 2)]
+    second = (-values[0] + 16 * values[1] - 30 * values[2] + 16 * values[3] - values[4]) / (12 * h**2)
+    np.testing.assert_allclose(jax.jit(jax.grad(jax.grad(height)))(at), second, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_vmap_is_the_loop(name, helix):
+    taus = jnp.array([[-15.0], [0.0], [8.0]])
+
+    def tip(tau):
+        return vsr.solve(helix, tau, model=MODELS[name]).tip
+
+    np.testing.assert_allclose(jax.jit(jax.vmap(tip))(taus), jnp.stack([tip(t) for t in taus]), atol=1e-12)
+
+
+def test_vmap_over_designs(helix):
+    radii = jnp.array([0.003, 0.004, 0.005])
+
+    def tip(radius):
+        scene = eqx.tree_at(lambda s: s.actuators[0].routing.radius, helix, radius)
+        return vsr.solve(scene, jnp.array([-5.0])).tip[:3, 3]
+
+    np.testing.assert_allclose(jax.jit(jax.vmap(tip))(radii), jnp.stack([tip(r) for r in radii]), atol=1e-13)
+
+
+def test_a_batch_of_equilibria_gives_its_results_under_vmap(helix):
+    eqs = jax.vmap(lambda tau: vsr.solve(helix, tau))(jnp.array([[-15.0], [-5.0]]))
+    assert "batch=(2,)" in repr(eqs)
+    tips = jax.vmap(lambda eq: eq.tip)(eqs)
+    np.testing.assert_allclose(tips[1], vsr.solve(helix, [-5.0]).tip, atol=1e-14)
+
+
+def test_a_scene_may_be_built_under_jit():
+    @jax.jit
+    def tip(radius):
+        arm = vsr.Rod(0.75, vsr.Circular(0.01), vsr.Material(5.93e5, shear=2e5))
+        return vsr.solve(vsr.Scene(arm, [vsr.Thread(vsr.Helix(radius, 1.529))]), jnp.array([-15.0])).tip[:3, 3]
+
+    np.testing.assert_allclose(tip(0.005), vsr.solve(paper.scene("B1"), [-15.0]).tip[:3, 3], atol=1e-13)
+
+
+@pytest.mark.parametrize("name", ["strain-dependent", "prescribed"])
+def test_gradients_in_single_precision(name, helix):
+    def height(scene, tau):
+        return vsr.solve(scene, tau, model=MODELS[name]).tip[2, 3]
+
+    double = jax.jit(jax.grad(height))(helix, jnp.array([-9.0])).actuators[0].routing
+    single = jax.jit(jax.grad(height))(helix.astype(jnp.float32), jnp.array([-9.0], jnp.float32)).actuators[0].routing
+    assert single.radius.dtype == jnp.float32
+    np.testing.assert_allclose(single.radius, double.radius, rtol=2e-4)
+    np.testing.assert_allclose(single.angle, double.angle, rtol=2e-4)
