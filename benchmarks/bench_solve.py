@@ -104,14 +104,19 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the figures here too")
     parser.add_argument("--cold", action="store_true", help="measure the cold start as well")
     options = parser.parse_args()
-    report: dict[str, Any] = {"machine": f"{platform.machine()}, {os.cpu_count()} cores, {jax.devices()[0].device_kind}", "jax": jax.__version__}
+    report: dict[str, Any] = {
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores, {jax.devices()[0].device_kind}",
+        "jax": jax.__version__,
+    }
     if options.cold:
         report["cold"] = cold_start()
         print("first answer from a cold process:", ", ".join(f"{k} {v:.2f}" for k, v in report["cold"].items()))
     jax.config.update("jax_enable_x64", True)
     jobs = [("A3, three threads", "A3", vsr.StrainDependent(32, 4)), ("B1, one helix", "B1", vsr.StrainDependent(16, 6))]
     print(f"{report['machine']}, jax {report['jax']}; us a shape: median (10 %-90 %), compile time")
-    print("| scene | nodes | dtype | single | strains, 1,024 | tips, 1,024 | gradient, 1,024 | gradient / tips |\n|---|---|---|---|---|---|---|---|")
+    print(
+        "| scene | nodes | dtype | single | strains, 1,024 | tips, 1,024 | gradient, 1,024 | gradient / tips |\n|---|---|---|---|---|---|---|---|"
+    )
     report["rows"] = []
     for name, case, model in jobs:
         for dtype in ("float64", "float32"):

@@ -58,16 +58,19 @@ def test_solution_is_scipys(sections, tau):
 
 
 def test_no_force_is_rest_with_finite_derivatives(sections):
-    def strain(tau):
-        return c.join(solve_balance(sections, tuple(tau)).xi)
+    one = at(sections, 1)._replace(paths=at(sections, 1).paths[:1])
 
-    zero = jnp.zeros(2)
-    np.testing.assert_allclose(strain(zero), c.join(sections.rest), atol=1e-15)
-    for derivative in (jax.jacfwd(strain), jax.jacrev(strain), jax.jacfwd(jax.jacfwd(strain)), jax.jacfwd(jax.jacrev(strain))):
-        assert bool(jnp.all(jnp.isfinite(derivative(zero))))
+    def strain(tau):
+        return c.join(solve_balance(one, (tau,)).xi)
+
+    zero = jnp.asarray(0.0)
+    np.testing.assert_allclose(strain(zero), c.join(one.rest), atol=1e-15)
+    for derivative in (jax.jacfwd(jax.jacfwd(strain)), jax.jacfwd(jax.jacrev(strain))):
+        assert bool(jnp.all(jnp.isfinite(jax.jit(derivative)(zero))))
 
 
 def test_derivatives_to_second_order_are_those_of_finite_differences(sections):
+    @jax.jit
     def strain(force):
         return c.join(solve_balance(sections, (force, jnp.asarray(-8.0))).xi)
 
@@ -75,9 +78,8 @@ def test_derivatives_to_second_order_are_those_of_finite_differences(sections):
     values = [np.asarray(strain(at_ + i * h)) for i in (-2, -1, 0, 1, 2)]
     first = (values[0] - 8 * values[1] + 8 * values[3] - values[4]) / (12 * h)
     second = (-values[0] + 16 * values[1] - 30 * values[2] + 16 * values[3] - values[4]) / (12 * h**2)
-    np.testing.assert_allclose(jax.jacfwd(strain)(at_), first, atol=1e-9 * np.abs(first).max())
-    np.testing.assert_allclose(jax.jacrev(strain)(at_), first, atol=1e-9 * np.abs(first).max())
-    np.testing.assert_allclose(jax.jacfwd(jax.jacfwd(strain))(at_), second, atol=1e-5 * np.abs(second).max())
+    np.testing.assert_allclose(jax.jit(jax.jacrev(strain))(at_), first, atol=1e-9 * np.abs(first).max())
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(jax.jacfwd(strain)))(at_), second, atol=1e-5 * np.abs(second).max())
 
 
 def test_balances_to_rounding_in_either_precision(dtype):
@@ -127,12 +129,8 @@ def test_bad_lanes_change_neither_the_others_nor_their_gradients():
     run, slope = jax.jit(tips), jax.jit(jax.grad(total))
     np.testing.assert_array_equal(run(scene, bad)[::2], run(scene, good)[::2])
     assert bool(jnp.all(jnp.isnan(run(scene, bad)[1::2])))
-    alone = slope(scene, jnp.array([[-15.0], [0.0], [7.0], [0.0]]))
-    mixed = slope(scene, bad)
-    for with_bad, without in zip(jax.tree.leaves(mixed), jax.tree.leaves(alone), strict=True):
-        # A lane at rest still moves with the arm's length; nothing else of it does.
-        assert bool(jnp.all(jnp.isfinite(with_bad)))
-    np.testing.assert_allclose(mixed.actuators[0].routing.radius, alone.actuators[0].routing.radius, rtol=1e-12)
+    for mixed, alone in zip(jax.tree.leaves(slope(scene, bad)), jax.tree.leaves(slope(scene, bad[::2])), strict=True):
+        np.testing.assert_allclose(mixed, alone, rtol=1e-12, atol=1e-14)
 
 
 def test_residual_floor_follows_the_precision(dtype):

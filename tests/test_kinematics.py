@@ -16,9 +16,7 @@ LENGTH = 0.75
 
 def strain(X):
     """A strain that turns about changing axes and does not commute with itself."""
-    return jnp.stack(
-        [2 + 3 * jnp.sin(7 * X), 4 * jnp.cos(5 * X), 6 * X, 1 + 0.1 * X, 0.2 * jnp.sin(9 * X), 0.1 * jnp.cos(4 * X)]
-    )
+    return jnp.stack([2 + 3 * jnp.sin(7 * X), 4 * jnp.cos(5 * X), 6 * X, 1 + 0.1 * X, 0.2 * jnp.sin(9 * X), 0.1 * jnp.cos(4 * X)])
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,9 @@ import vsr_jax
 
 FOLDER = pathlib.Path(vsr_jax.__file__).parent
 LAYERS = """
-_types _check component se3 quadrature profile section routing actuator rod scene newton balance kinematics basis
-model discrete strain_dependent continuum equilibrium solve plot paper paper_figures reproduce cli
-""".split()
+_types _check component se3 quadrature profile section routing actuator rod scene newton balance kinematics basis model discrete
+strain_dependent continuum equilibrium solve plot paper paper_figures reproduce cli
+""".split()  # noqa: SIM905
 
 
 def imports(path):

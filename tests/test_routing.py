@@ -23,7 +23,7 @@ def test_linear():
 
 def test_parallel_has_no_slope():
     p = path(vsr.Parallel(0.001, 0.002))
-    assert not np.any(p.slope_y) and not np.any(p.slope_z)
+    assert not np.any([p.slope_y, p.slope_z])
 
 
 @pytest.mark.parametrize(("hand", "sign"), [("right", 1), ("left", -1)])

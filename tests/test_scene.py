@@ -54,7 +54,10 @@ def test_throw_raises_with_the_status_in_words():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: vsr.Scene(ARM, [vsr.Thread(vsr.Parallel(0.02, 0.0))]), r"actuators\[0\]\.routing: the thread lies 0\.01 m outside the section"),
+        (
+            lambda: vsr.Scene(ARM, [vsr.Thread(vsr.Parallel(0.02, 0.0))]),
+            r"actuators\[0\]\.routing: the thread lies 0\.01 m outside the section",
+        ),
         (lambda: vsr.Scene(ARM, [vsr.Thread(vsr.Linear(0.0, 0.0, 0.1))]), r"0\.04 m outside the section at X = 0\.5 m"),
         (lambda: vsr.Scene(ARM, [vsr.Parallel(0.0, 0.0)]), r"Scene\.actuators\[0\]: got .*, need a Thread, Tendon or Chamber"),
         (lambda: vsr.Scene("arm", []), "Scene.rod: got 'arm', need a Rod"),

@@ -58,7 +58,9 @@ def test_derivatives_by_every_number_agree(name, scene):
         unit = jnp.zeros_like(numbers).at[i].set(1.0)
         forward, h = push(numbers, unit), 1e-4 * abs(x) or 1e-6
         scale = np.abs(forward).max() + 1e-9
-        difference = (8 * (value(numbers + h * unit) - value(numbers - h * unit)) - value(numbers + 2 * h * unit) + value(numbers - 2 * h * unit)) / (12 * h)
+        difference = (
+            8 * (value(numbers + h * unit) - value(numbers - h * unit)) - value(numbers + 2 * h * unit) + value(numbers - 2 * h * unit)
+        ) / (12 * h)
         np.testing.assert_allclose(forward / scale, difference / scale, atol=accuracy, err_msg=f"number {i}, value {x}")
         np.testing.assert_allclose(reverse[i] / scale, jnp.dot(cotangent, forward) / scale, atol=1e-9, err_msg=f"number {i}, value {x}")
 

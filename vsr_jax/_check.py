@@ -39,9 +39,8 @@ def numbers(name: str, value: Any, shape: tuple[int, ...] | None = (), *, positi
     if shape is not None and array.shape != shape:
         raise ValueError(f"{name}: got shape {array.shape}, need {needed}")
     known = concrete(array)
-    if known is not None:
-        if (finite and not np.all(np.isfinite(known))) or (positive and not np.all(known > 0)):
-            raise _refuse(name, value, needed)
+    if known is not None and ((finite and not np.all(np.isfinite(known))) or (positive and not np.all(known > 0))):
+        raise _refuse(name, value, needed)
     return array
 
 

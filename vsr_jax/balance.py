@@ -6,7 +6,7 @@ $$r(\xi) = \Sigma (\xi - \xi^*) - B_\tau(\xi) \tau - \Lambda = 0. \qquad (21)$$
 
 Column i of $B_\tau$ is $(d \times t, t) = \partial |t_c| / \partial \xi$, the gradient of thread i's length, so the tangent
 
-$$H = \partial r / \partial \xi = \Sigma - A, \qquad A = \sum_i \frac{\tau_i}{|t_c|} P^T (1 - t t^T) P, \qquad P = [-\tilde d, 1] \qquad (13)$$
+$$H = \frac{\partial r}{\partial \xi} = \Sigma - A, \quad A = \sum_i \frac{\tau_i}{|t_c|} P^T (1 - t t^T) P, \quad P = [-\tilde d, 1] \quad (13)$$
 
 is symmetric. Symbols, each a tuple of component arrays of one shape (see `component`):
 
@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .component import Matrix, Vector, add, cholesky, cholesky_solve, dot, scale, subtract
+from .component import Matrix, Vector, add, cholesky, cholesky_solve, dot, multiply, scale, subtract
 from .newton import Evaluation, newton
 from .routing import Path
 from .scene import CrossSections
@@ -65,7 +65,7 @@ def actuation_wrench(xi: Vector, sections: CrossSections, tau: Vector) -> Vector
 
 def residual(xi: Vector, sections: CrossSections, tau: Vector, reaction: Vector | None = None) -> Vector:
     """Imbalance of a cross-section (eq. 21): $r = \\Sigma (\\xi - \\xi^*) - B_\\tau \\tau - \\Lambda$."""
-    elastic = tuple(s * x for s, x in zip(sections.stiffness, subtract(xi, sections.rest), strict=True))
+    elastic = multiply(sections.stiffness, subtract(xi, sections.rest))
     r = subtract(elastic, actuation_wrench(xi, sections, tau))
     return r if reaction is None else subtract(r, reaction)
 
@@ -122,13 +122,16 @@ def solve_balance(sections: CrossSections, tau: Vector, reaction: Vector | None 
     rest = tuple(jnp.broadcast_to(x, shape) for x in sections.rest)
     floor = jnp.broadcast_to(rounding_floor(stiffness, tau), shape)
 
+    compliance = tuple(1 / s for s in stiffness)
+
     def evaluate(xi: Vector) -> Evaluation:
         r = residual(xi, sections, tau, reaction)
+        elastic = multiply(compliance, r)
         step = cholesky_solve(cholesky(tangent(xi, sections, tau)), r)
         definite = ~jnp.isnan(step[5])
-        step = tuple(jnp.where(definite, x, f / s) for x, f, s in zip(step, r, stiffness, strict=True))
-        size = strain_norm(tuple(s * x for s, x in zip(stiffness, step, strict=True)), stiffness)
-        return Evaluation(step, size, strain_norm(r, stiffness), definite)
+        step = tuple(jnp.where(definite, x, e) for x, e in zip(step, elastic, strict=True))
+        size = jnp.sqrt(dot(step, multiply(stiffness, step)) * compliance[3])
+        return Evaluation(step, size, jnp.sqrt(dot(r, elastic) * compliance[3]), definite)
 
     xi, definite, steps = newton(evaluate, rest, floor)
     balanced = strain_norm(residual(xi, sections, tau, reaction), stiffness) <= 16 * floor

@@ -43,6 +43,11 @@ def subtract(a: Vector, b: Vector) -> Vector:
     return tuple(x - y for x, y in zip(a, b, strict=True))
 
 
+def multiply(a: Vector, b: Vector) -> Vector:
+    """Component-wise product, as of a diagonal matrix and a vector."""
+    return tuple(x * y for x, y in zip(a, b, strict=True))
+
+
 def scale(s: Array | float, a: Vector) -> Vector:
     """Product $s a$ of a scalar and a vector."""
     return tuple(s * x for x in a)

@@ -176,9 +176,9 @@ def actuation_matrix(scene: Scene, basis: AbstractBasis, q: Float[Array, " dofs"
 def jacobian(
     scene: Scene, basis: AbstractBasis, q: Float[Array, " dofs"], X: Any = None, *, steps: int = 32, order: int = 6
 ) -> Float[Array, "6 dofs"]:
-    r"""Geometric Jacobian (eq. 15): $J(q, X) = \mathrm{Ad}_g^{-1} \int_0^X \mathrm{Ad}_g B_q \, ds$, so that $\eta = J \dot q$ in the body frame.
+    r"""Geometric Jacobian (eq. 15): $J(q, X) = \mathrm{Ad}_g^{-1} \int_0^X \mathrm{Ad}_g B_q \, ds$.
 
-    It is the exact derivative of the pose steps, hence of their order.
+    The body twist of the section at X is $\eta = J \dot q$. It is the exact derivative of the pose steps, hence of their order.
 
     **Arguments:**
     - `q`: coordinates, shape (n,).

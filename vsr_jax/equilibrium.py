@@ -85,9 +85,7 @@ class Equilibrium(eqx.Module):
 
     def thread(self, index: int, X: Any) -> Float[Array, "... 3"]:
         """Position [m] of thread `index` where it crosses the sections at X: $r + R d$."""
-        stations = self._abscissas(X)
-        g, path = self.pose(stations), self.scene.sections(stations).paths[index]
-        return g[..., :3, 3] + g[..., :3, 1] * path.y[..., None] + g[..., :3, 2] * path.z[..., None]
+        return self._thread(index, self._abscissas(X))
 
     def __repr__(self) -> str:
         if is_traced(self.status) or jnp.ndim(self.status) > 0:
@@ -118,6 +116,11 @@ class Equilibrium(eqx.Module):
     def _poses(self, X: Array) -> Array:
         poses = self.model.poses(self.scene, self._sound_inputs, self._state, jnp.atleast_1d(X))
         return self._mask(poses.reshape(*X.shape, 4, 4))
+
+    @eqx.filter_jit
+    def _thread(self, index: int, X: Array) -> Array:
+        g, path = self._poses(X), self.scene.sections(X).paths[index]
+        return g[..., :3, 3] + g[..., :3, 1] * path.y[..., None] + g[..., :3, 2] * path.z[..., None]
 
     @eqx.filter_jit
     def _strain(self, X: Array) -> Array:
