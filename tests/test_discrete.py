@@ -1,5 +1,7 @@
 """The prescribed-basis model: K, B(q), eq. 18 and eq. 20."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -38,7 +40,7 @@ def test_B_is_the_transposed_derivative_of_the_thread_lengths(basis):
 
     def lengths(q):
         total = 0.0
-        for a, b in zip(edges, edges[1:], strict=False):
+        for a, b in itertools.pairwise(edges):
             X = jnp.linspace(a, b, 801)
             inside = jnp.clip(X, a + 1e-13, b - 1e-13)
             xi = jax.vmap(lambda x: basis.matrix(x, scene.rod.length) @ q)(inside) + jnp.eye(6)[3]
@@ -138,7 +140,7 @@ def test_legendre_bases_converge_geometrically(capsys):
     with capsys.disabled():
         print("\nB1, Prescribed, tip error [m] by Legendre order:", ", ".join(f"{n}: {e:.1e}" for n, e in zip(orders, errors, strict=True)))
     assert errors[-1] < 2e-5
-    for coarse, fine in zip(errors[2:], errors[3:], strict=False):
+    for coarse, fine in itertools.pairwise(errors[2:]):
         assert fine < coarse / 4
 
 

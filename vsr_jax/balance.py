@@ -6,9 +6,9 @@ $$r(\xi) = \Sigma (\xi - \xi^*) - B_\tau(\xi) \tau - \Lambda = 0. \qquad (21)$$
 
 Column i of $B_\tau$ is $(d \times t, t) = \partial |t_c| / \partial \xi$, the gradient of thread i's length, so the tangent
 
-$$H = \frac{\partial r}{\partial \xi} = \Sigma - A, \quad A = \sum_i \frac{\tau_i}{|t_c|} P^T (1 - t t^T) P, \quad P = [-\tilde d, 1] \quad (13)$$
+$$H = \frac{\partial r}{\partial \xi} = \Sigma - A, \quad A = \sum_i \frac{\tau_i}{|t_c|} P^T (1 - t t^T) P, \qquad (13)$$
 
-is symmetric. Symbols, each a tuple of component arrays of one shape (see `component`):
+with $P = [-\tilde d, 1]$, is symmetric. Symbols, each a tuple of component arrays of one shape (see `component`):
 
 - `xi` $= (k\,[1/m], u\,[-])$: strain, angular first; `rest` $= \xi^*$; `stiffness`: the diagonal of $\Sigma$;
 - $d = (0, d_y, d_z)$ [m]: where a thread crosses the section; $t_c = k \times d + u + d'$ its tangent, $t = t_c / |t_c|$;

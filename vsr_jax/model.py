@@ -123,7 +123,7 @@ def classify(xi: Vector, sections: CrossSections, tau: Vector, balanced: Array, 
     for path in sections.paths:
         rest = thread_tangent(sections.rest, path)
         left = jnp.minimum(left, dot(thread_tangent(xi, path), rest) / dot(rest, rest))
-    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in xi]))
+    finite = jnp.all(jnp.isfinite(sum(xi)))
     collapsed = jnp.any(~balanced & pulling) | jnp.any(left <= 0)
     status = jnp.where(jnp.all(balanced), Status.CONVERGED, Status.MAX_STEPS)
     status = jnp.where(jnp.all(definite), status, Status.UNSTABLE)
