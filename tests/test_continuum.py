@@ -65,6 +65,8 @@ def test_too_few_steps_are_reported(helix):
     eq = vsr.solve(helix, [-15.0], model=vsr.Continuum(rtol=1e-10, atol=1e-12, max_steps=8))
     assert int(eq.status) == vsr.Status.MAX_STEPS
     assert bool(jnp.all(jnp.isnan(eq.tip)))
+    with pytest.raises(ValueError, match="q: got a solution by Continuum"):
+        _ = eq.q
 
 
 def test_precision_follows_the_inputs(dtype, helix):

@@ -110,6 +110,7 @@ def test_a_scene_without_actuators_is_at_rest():
     eq = vsr.solve(vsr.Scene(ARM, []), [])
     assert bool(eq.converged)
     np.testing.assert_allclose(eq.position(0.5), [0.5, 0.0, 0.0], atol=1e-15)
+    assert eq.q.shape == eq.lengths.shape == (0,)
 
 
 def test_repr_tells_the_outcome():

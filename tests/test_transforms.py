@@ -33,11 +33,11 @@ INPUTS = jnp.array([-2e5])
 
 
 def results(scene, inputs, model):
-    """The tip and, for the exact model, every other result."""
+    """The tip and, for the exact model, the other results; a pose holds the strains up to it."""
     eq = vsr.solve(scene, inputs, model=model)
     if not isinstance(model, vsr.StrainDependent):
         return eq.tip[:3].ravel()
-    return jnp.concatenate([eq.tip[:3].ravel(), eq.pose(0.31)[:3].ravel(), eq.strain(0.2), eq.lengths, eq.q])
+    return jnp.concatenate([eq.tip[:3].ravel(), eq.pose(0.31)[:3].ravel(), eq.lengths, eq.q])
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -100,6 +100,8 @@ def test_vmap_over_designs(helix):
 def test_a_batch_of_equilibria_gives_its_results_under_vmap(helix):
     eqs = jax.vmap(lambda tau: vsr.solve(helix, tau))(jnp.array([[-15.0], [-5.0]]))
     assert "batch=(2,)" in repr(eqs)
+    with pytest.raises(ValueError, match=r"got a batch of shape \(2,\), need jax\.vmap"):
+        _ = eqs.tip
     tips = jax.vmap(lambda eq: eq.tip)(eqs)
     np.testing.assert_allclose(tips[1], vsr.solve(helix, [-5.0]).tip, atol=1e-14)
 
@@ -113,10 +115,9 @@ def test_a_scene_may_be_built_under_jit():
     np.testing.assert_allclose(tip(0.005), vsr.solve(paper.scene("B1"), [-15.0]).tip[:3, 3], atol=1e-13)
 
 
-@pytest.mark.parametrize("name", ["strain-dependent", "prescribed"])
-def test_gradients_in_single_precision(name, helix):
+def test_gradients_in_single_precision(helix):
     def height(scene, tau):
-        return vsr.solve(scene, tau, model=MODELS[name]).tip[2, 3]
+        return vsr.solve(scene, tau, model=MODELS["strain-dependent"]).tip[2, 3]
 
     double = jax.jit(jax.grad(height))(helix, jnp.array([-9.0])).actuators[0].routing
     single = jax.jit(jax.grad(height))(helix.astype(jnp.float32), jnp.array([-9.0], jnp.float32)).actuators[0].routing

@@ -137,6 +137,9 @@ class Prescribed(SteppedModel):
         status = classify(projection.strain(q), projection.sections, tau, balanced, definite)
         return Outcome(jnp.where(status == 0, q, 0.0), status, steps)
 
+    def coordinates(self, scene: Scene, inputs: Float[Array, " inputs"], state: Array) -> Float[Array, " dofs"]:
+        return state
+
     def node_strain(self, scene: Scene, inputs: Float[Array, " inputs"], state: Array) -> Vector:
         X = self.grid(scene).X
         return tuple(x.reshape(X.shape) for x in self.strain(scene, inputs, state, X.reshape(-1)))

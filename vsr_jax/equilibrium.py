@@ -3,7 +3,6 @@
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -48,14 +47,14 @@ class Equilibrium(eqx.Module):
 
     @property
     def q(self) -> Float[Array, " dofs"]:
-        """Coordinates of the strain in the model's basis: those of `Prescribed`, the thread forces for `StrainDependent`."""
-        if isinstance(self._state, jax.Array):
-            return self._mask(self._state)
-        return self._mask(jnp.stack(self.scene.forces(self._sound_inputs)))
+        """Coordinates of the strain in the model's basis: those of `Prescribed`, the thread forces (eq. 20) for `StrainDependent`."""
+        self._refuse_batch()
+        return self._mask(self.model.coordinates(self.scene, self._sound_inputs, self._state))
 
     @property
     def tip(self) -> Pose:
         """Pose of the arm's end, shape (4, 4), position in metres."""
+        self._refuse_batch()
         return self._tip()
 
     def pose(self, X: Any) -> Float[Array, "... 4 4"]:
@@ -76,11 +75,13 @@ class Equilibrium(eqx.Module):
 
         1 for an arm without forces, at least 1 for tendons alone up to rounding, 0 where the equilibrium ceases to be stable.
         """
+        self._refuse_batch()
         return self._stability()
 
     @property
     def lengths(self) -> Float[Array, " threads"]:
         """Length of each thread's path, $l_i = \\int |t_{ci}| dX$ [m]."""
+        self._refuse_batch()
         return self._lengths()
 
     def thread(self, index: int, X: Any) -> Float[Array, "... 3"]:
@@ -102,7 +103,14 @@ class Equilibrium(eqx.Module):
     def _mask(self, value: Array) -> Array:
         return jnp.where(self.converged, value, jnp.nan)
 
+    def _refuse_batch(self) -> None:
+        if jnp.ndim(self.status) > 0:
+            raise ValueError(
+                f"Equilibrium: got a batch of shape {jnp.shape(self.status)}, need jax.vmap, as in jax.vmap(lambda eq: eq.tip)(eqs)"
+            )
+
     def _abscissas(self, X: Any) -> Array:
+        self._refuse_batch()
         array = jnp.asarray(X, self.inputs.dtype)
         if array.ndim > 1:
             raise ValueError(f"X: got shape {array.shape}, need one abscissa or several in a row")
@@ -143,4 +151,4 @@ class Equilibrium(eqx.Module):
     @eqx.filter_jit
     def _lengths(self) -> Array:
         xi, sections, weight = self._along()
-        return self._mask(jnp.stack([jnp.sum(weight * thread_direction(xi, path)[1]) for path in sections.paths]))
+        return self._mask(jnp.array([jnp.sum(weight * thread_direction(xi, path)[1]) for path in sections.paths], weight.dtype))

@@ -73,6 +73,10 @@ class Model(eqx.Module):
     ) -> Float[Array, "stations 4 4"]:
         """Poses at abscissas X."""
 
+    def coordinates(self, scene: Scene, inputs: Float[Array, " inputs"], state: Any) -> Float[Array, " dofs"]:
+        """Coordinates of the strain in the model's basis."""
+        raise ValueError(f"q: got a solution by {type(self).__name__}, need one by StrainDependent or Prescribed")
+
     @abstractmethod
     def grid(self, scene: Scene) -> Grid:
         """Steps and nodes on which quantities along the arm are summed."""

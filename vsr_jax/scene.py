@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ._check import concrete, instance, is_traced, numbers
-from ._types import Scalar
+from ._types import Scalar, cast
 from .actuator import Actuator
 from .component import Vector
 from .quadrature import piece_edges
@@ -102,7 +102,7 @@ class Scene(eqx.Module):
 
     def astype(self, dtype: Any) -> "Scene":
         """The same scene with its floating-point numbers in `dtype`."""
-        return jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, self)
+        return cast(self, dtype)
 
     def _check_sizes_and_threads(self) -> None:
         if any(is_traced(leaf) for leaf in jax.tree.leaves((self.rod, self.actuators))):

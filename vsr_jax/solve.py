@@ -3,11 +3,11 @@
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ._check import instance, is_traced
+from ._types import cast
 from .equilibrium import Equilibrium
 from .model import Model, Outcome, Status
 from .scene import Scene
@@ -41,13 +41,9 @@ def solve(scene: Scene, inputs: Any, *, model: Model | None = None, throw: bool 
     instance("scene", scene, Scene, "a Scene")
     values = scene.check_inputs(inputs)
     chosen = StrainDependent() if model is None else instance("model", model, Model, "StrainDependent(), Prescribed(basis) or Continuum()")
-    scene, chosen = (_astype(part, values.dtype) for part in (scene, chosen))
+    scene, chosen = cast((scene, chosen), values.dtype)
     equilibrium = Equilibrium(scene, values, chosen, _solve(scene, values, chosen))
     return _raise_if_failed(equilibrium) if throw else equilibrium
-
-
-def _astype(part: Any, dtype: Any) -> Any:
-    return jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, part)
 
 
 @eqx.filter_jit

@@ -3,6 +3,7 @@ r"""The model of eq. 19-21: the basis $B_q = \Sigma^{-1} B_\tau(\xi)$ makes $q =
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ._check import choice, count
@@ -39,6 +40,9 @@ class StrainDependent(SteppedModel):
 
     def node_strain(self, scene: Scene, inputs: Float[Array, " inputs"], state: Vector) -> Vector:
         return state
+
+    def coordinates(self, scene: Scene, inputs: Float[Array, " inputs"], state: Vector) -> Float[Array, " dofs"]:
+        return jnp.array(scene.forces(inputs), inputs.dtype)
 
     def strain(self, scene: Scene, inputs: Float[Array, " inputs"], state: Any, X: Float[Array, " stations"]) -> Vector:
         return solve_balance(scene.sections(X), scene.forces(inputs)).xi
