@@ -8,7 +8,6 @@ from jaxtyping import Array, Float
 
 Scalar = Float[Array, ""]
 Twist = Float[Array, "6"]
-Wrench = Float[Array, "6"]
 Pose = Float[Array, "4 4"]
 
 

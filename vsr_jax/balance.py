@@ -101,6 +101,11 @@ def rounding_floor(stiffness: Vector, tau: Vector) -> Array:
     return 64 * jnp.finfo(stiffness[3].dtype).eps * (1 + load / stiffness[3])
 
 
+def forces_where(sound: Array, tau: Vector) -> Vector:
+    """Thread forces where the solution is sound and none elsewhere, so that what follows stays finite there."""
+    return tuple(jnp.where(sound, force, 0.0) for force in tau)
+
+
 def no_derivative(*values: Array) -> tuple[Any, ...]:
     """Tangents of integer and boolean outputs."""
     return tuple(np.zeros(value.shape, jax.dtypes.float0) for value in values)
@@ -147,13 +152,10 @@ def _solve_balance_jvp(primals: tuple, tangents: tuple) -> tuple[Balance, Balanc
     sound = solution.balanced & solution.definite
     xi = tuple(jnp.where(sound, x, rest) for x, rest in zip(solution.xi, sections.rest, strict=True))
 
-    def sound_forces(tau: Vector) -> Vector:
-        return tuple(jnp.where(sound, force, 0.0) for force in tau)
-
     def imbalance(sections: CrossSections, tau: Vector, reaction: Vector | None) -> Vector:
-        return residual(xi, sections, sound_forces(tau), reaction)
+        return residual(xi, sections, forces_where(sound, tau), reaction)
 
     _, change = jax.jvp(imbalance, primals, tangents)
-    factor = cholesky(tangent(xi, sections, sound_forces(tau)))
+    factor = cholesky(tangent(xi, sections, forces_where(sound, tau)))
     d_xi = scale(-1.0, cholesky_solve(factor, change))
     return solution, Balance(d_xi, *no_derivative(*solution[1:]))

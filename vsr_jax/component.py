@@ -28,9 +28,10 @@ def join_matrix(rows: Matrix) -> Array:
     return jnp.stack([join(row) for row in rows], axis=-2)
 
 
-def split_matrix(array: Array) -> Matrix:
-    """Rows of components of the last two axes of `array`; the inverse of `join_matrix`."""
-    return tuple(split(array[..., i, :]) for i in range(array.shape[-2]))
+def symmetric(lower: Matrix) -> Matrix:
+    """The whole symmetric matrix from its lower triangle."""
+    size = len(lower)
+    return tuple(tuple(lower[max(i, j)][min(i, j)] for j in range(size)) for i in range(size))
 
 
 def add(a: Vector, b: Vector) -> Vector:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from . import component as c
 from ._check import count, instance, numbers
 from ._types import Pose, Scalar, Twist
-from .balance import residual, rounding_floor, solve_balance, strain_norm, tangent
+from .balance import forces_where, residual, rounding_floor, solve_balance, strain_norm, tangent
 from .component import Vector
 from .model import Model, Outcome, Status, classify
 from .quadrature import Grid
@@ -160,7 +160,7 @@ def _integrate(model: Continuum, scene: Scene, inputs: Array, saveat: diffrax.Sa
     status = classify(end.xi, sections, tau, end.balanced, end.definite)
     sound = status == Status.CONVERGED
     xi = jnp.where(sound, c.join(end.xi), c.join(sections.rest))
-    tau = tuple(jnp.where(sound, force, 0.0) for force in tau)
+    tau = forces_where(sound, tau)
 
     def field(x: Any, line: Line, _: None) -> Line:
         return Line(strain_rate(scene, tau, line.xi, x), line.g @ hat(line.xi))

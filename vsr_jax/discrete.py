@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from . import component as c
 from ._check import choice, count, instance
 from ._types import Scalar
-from .balance import no_derivative, residual, rounding_floor, tangent, thread_direction, thread_wrench
+from .balance import forces_where, no_derivative, residual, rounding_floor, tangent, thread_direction, thread_wrench
 from .basis import AbstractBasis
 from .component import Vector
 from .kinematics import ORDERS, accumulate_jacobian
@@ -37,8 +37,7 @@ class Projection(NamedTuple):
 
     def stiffness(self, lower: c.Matrix) -> Float[Array, "dofs dofs"]:
         """Generalised stiffness $\\int B_q^T H B_q \\, dX$ of a symmetric $H$ given by its lower triangle."""
-        rows = tuple(tuple(lower[max(i, j)][min(i, j)] for j in range(6)) for i in range(6))
-        weighted = self.weight[:, None, None] * (c.join_matrix(rows) @ self.matrix)
+        weighted = self.weight[:, None, None] * (c.join_matrix(c.symmetric(lower)) @ self.matrix)
         return jnp.einsum("xia,xib->ab", self.matrix, weighted)
 
     def elastic_stiffness(self) -> Float[Array, "dofs dofs"]:
@@ -96,14 +95,11 @@ def _solve_projected_jvp(primals: tuple, tangents: tuple) -> tuple:
     sound = balanced & definite
     q_sound = jnp.where(sound, q, 0.0)
 
-    def sound_forces(tau: Vector) -> Vector:
-        return tuple(jnp.where(sound, force, 0.0) for force in tau)
-
     def imbalance(projection: Projection, tau: Vector) -> Array:
-        return projection.integrate(residual(projection.strain(q_sound), projection.sections, sound_forces(tau)))
+        return projection.integrate(residual(projection.strain(q_sound), projection.sections, forces_where(sound, tau)))
 
     _, change = jax.jvp(imbalance, primals, tangents)
-    H = projection.stiffness(tangent(projection.strain(q_sound), projection.sections, sound_forces(tau)))
+    H = projection.stiffness(tangent(projection.strain(q_sound), projection.sections, forces_where(sound, tau)))
     return (q, balanced, definite, steps), (-_solve(H, change), *no_derivative(balanced, definite, steps))
 
 

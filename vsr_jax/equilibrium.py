@@ -144,9 +144,9 @@ class Equilibrium(eqx.Module):
     def _stability(self) -> Scalar:
         xi, sections, _ = self._along()
         lower = tangent(xi, sections, self.scene.forces(self._sound_inputs))
-        root = tuple(jnp.sqrt(s) for s in sections.stiffness)
-        scaled = tuple(tuple(lower[max(i, j)][min(i, j)] / (root[i] * root[j]) for j in range(6)) for i in range(6))
-        return self._mask(jnp.min(jnp.linalg.eigvalsh(c.join_matrix(scaled))))
+        root = jnp.sqrt(c.join(sections.stiffness))
+        scaled = c.join_matrix(c.symmetric(lower)) / (root[:, :, None] * root[:, None, :])
+        return self._mask(jnp.min(jnp.linalg.eigvalsh(scaled)))
 
     @eqx.filter_jit
     def _lengths(self) -> Array:
