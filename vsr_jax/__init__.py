@@ -21,10 +21,18 @@ from .discrete import (
 )
 from .equilibrium import Equilibrium as Equilibrium
 from .kinematics import step_twist as step_twist, zanna_step as zanna_step
+from .load import (
+    DistributedWrench as DistributedWrench,
+    Gravity as Gravity,
+    PointWrench as PointWrench,
+    TipWrench as TipWrench,
+)
+from .material import Material as Material
 from .model import Status as Status
 from .profile import (
     Constant as Constant,
     FunctionProfile as FunctionProfile,
+    Piecewise as Piecewise,
     PolynomialProfile as PolynomialProfile,
     SplineProfile as SplineProfile,
     Taper as Taper,
@@ -43,7 +51,7 @@ from .section import (
     Annular as Annular,
     Circular as Circular,
     Elliptic as Elliptic,
-    Material as Material,
+    Joined as Joined,
     Rectangular as Rectangular,
 )
 from .solve import SolveError as SolveError, solve as solve

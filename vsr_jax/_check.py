@@ -23,10 +23,12 @@ def _refuse(name: str, value: Any, needed: str) -> ValueError:
     return ValueError(f"{name}: got {value!r}, need {needed}")
 
 
-def numbers(name: str, value: Any, shape: tuple[int, ...] | None = (), *, positive: bool = False, finite: bool = True) -> Array:
-    """`value` as a floating-point array of `shape` (any shape for None), finite and positive, as wanted, where it is known."""
+def numbers(
+    name: str, value: Any, shape: tuple[int, ...] | None = (), *, positive: bool = False, least: float = -np.inf, finite: bool = True
+) -> Array:
+    """`value` as a floating-point array of `shape` (any shape for None), finite, positive and at `least`, as wanted, where it is known."""
     kind = "a finite number" if shape == () else "finite numbers" if shape is None else f"finite numbers of shape {shape}"
-    needed = kind + (" > 0" if positive else "")
+    needed = kind + (" > 0" if positive else f" >= {least:g}" if least > -np.inf else "")
     if isinstance(value, str):
         raise _refuse(name, value, needed)
     try:
@@ -39,7 +41,9 @@ def numbers(name: str, value: Any, shape: tuple[int, ...] | None = (), *, positi
     if shape is not None and array.shape != shape:
         raise ValueError(f"{name}: got shape {array.shape}, need {needed}")
     known = concrete(array)
-    if known is not None and ((finite and not np.all(np.isfinite(known))) or (positive and not np.all(known > 0))):
+    if known is None:
+        return array
+    if (finite and not np.all(np.isfinite(known))) or (positive and not np.all(known > 0)) or np.any(known < least):
         raise _refuse(name, value, needed)
     return array
 

@@ -13,11 +13,12 @@ import numpy as np
 from ._check import choice
 from .actuator import Thread
 from .basis import Basis, Family, Monomial, PiecewiseConstant, Trigonometric
+from .material import Material
 from .profile import Taper
 from .rod import Rod
 from .routing import Helix, Linear, Routing
 from .scene import Scene
-from .section import Circular, Material
+from .section import Circular
 
 LENGTH = 0.75
 TIP_RADIUS = 0.01

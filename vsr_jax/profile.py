@@ -5,7 +5,7 @@ Wherever a profile is expected a plain number means `Constant` and a Python func
 """
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -145,6 +145,48 @@ class SplineProfile(Profile):
         return self.values[i] + h * s * (d0 + s * ((3 * secant - 2 * d0 - d1) + s * (d0 + d1 - 2 * secant)))
 
 
+class Piecewise(Profile):
+    """One profile after another, with jumps between them.
+
+    **Arguments:**
+    - `ends`: where each profile but the last ends [m], rising.
+    - `values`: profiles (or numbers, or functions of X), one more than `ends`. Each is a function of X on the whole arm.
+    """
+
+    ends: Float[Array, " inner"]
+    values: tuple[Profile, ...]
+
+    def __init__(self, ends: Any, values: Sequence[Any]):
+        self.ends = rising_ends("Piecewise", ends, values)
+        self.values = tuple(as_profile(f"Piecewise.values[{i}]", value) for i, value in enumerate(values))
+
+    def __call__(self, X: Scalar, length: Scalar) -> Scalar:
+        return pick(X, self.ends, [value(X, length) for value in self.values])
+
+    @property
+    def breakpoints(self) -> tuple[Scalar, ...]:
+        return (*(end for end in self.ends), *(x for value in self.values for x in value.breakpoints))
+
+
+def rising_ends(owner: str, ends: Any, parts: Sequence[Any]) -> Float[Array, " inner"]:
+    """Inner ends of `parts` laid one after another, checked."""
+    array = numbers(f"{owner}.ends", ends, None)
+    known = concrete(array)
+    if array.ndim != 1 or (known is not None and not np.all(np.diff(known, prepend=0.0) > 0)):
+        raise ValueError(f"{owner}.ends: got {ends!r}, need rising abscissas > 0 in a row")
+    if len(parts) != array.size + 1:
+        raise ValueError(f"{owner}: got {array.size} ends and {len(parts)} parts, need one part more than ends")
+    return array
+
+
+def pick(X: Scalar, ends: Float[Array, " inner"], values: Sequence[Any]) -> Any:
+    """The one of `values`, numbers or pytrees of them, in whose part X lies."""
+    result = values[-1]
+    for i in reversed(range(ends.size)):
+        result = jax.tree.map(lambda here, later, end=ends[i]: jnp.where(end > X, here, later), values[i], result)
+    return result
+
+
 class FunctionProfile(Profile):
     """Any function of X: $f(X) =$ `function(X, *parameters)`, a scalar; see `FunctionOfX` for the arguments."""
 
@@ -162,6 +204,11 @@ def as_profile(name: str, value: Any, *, positive: bool = False) -> Profile:
     if isinstance(value, Taper):
         numbers(f"{name} (Taper.base)", value.base, positive=positive)
         numbers(f"{name} (Taper.tip)", value.tip, positive=positive)
+    if isinstance(value, Constant):
+        numbers(name, value.value, positive=positive)
+    if isinstance(value, Piecewise) and positive:
+        for i, part in enumerate(value.values):
+            as_profile(f"{name} (Piecewise.values[{i}])", part, positive=True)
     if isinstance(value, Profile):
         return value
     if callable(value):

@@ -11,8 +11,9 @@ from jaxtyping import Array
 from ._check import instance, numbers
 from ._types import Pose, Scalar
 from .component import Vector
+from .material import Material
 from .profile import FunctionOfX, Profile, as_profile
-from .section import Material, Section
+from .section import Section
 
 STRAINS = ("torsion", "bending_y", "bending_z", "elongation", "shear_y", "shear_z")
 """Names of the six strains $(k_x, k_y, k_z, u_x, u_y, u_z)$ in order."""
@@ -74,9 +75,9 @@ class Rod(eqx.Module):
 
     @property
     def breakpoints(self) -> tuple[Scalar, ...]:
-        """Abscissas [m] where a derivative of a size or of the rest strain jumps."""
+        """Abscissas [m] where a size, the material, the rest strain or a derivative of them jumps."""
         rest = () if isinstance(self.rest_strain, FunctionOfX) else self.rest_strain
-        return tuple(point for profile in (*self.section.sizes.values(), *rest) for point in profile.breakpoints)
+        return (*self.section.breakpoints, *self.material.breakpoints, *(x for profile in rest for x in profile.breakpoints))
 
 
 def _rest_strain(value: Any) -> tuple[Profile, ...] | FunctionOfX:

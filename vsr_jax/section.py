@@ -1,44 +1,42 @@
-r"""Cross-sections and materials: what makes the stiffness $\Sigma = \mathrm{diag}(G J_x, E J_y, E J_z, E A, \kappa_y G A, \kappa_z G A)$.
+"""Cross-sections: their shapes, areas and second moments.
 
 The y and z axes lie in the section, x along the arm. Sizes are profiles: a number, a `Profile` or a function of X.
 """
 
 import math
 from abc import abstractmethod
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ._check import choice, numbers
+from ._check import choice, instance, numbers
 from ._types import Scalar
-from .component import Vector
-from .profile import Profile, as_profile
+from .profile import Profile, as_profile, pick, rising_ends
 
 Torsion = Literal["saint_venant", "polar"]
 
 
 class Geometry(eqx.Module):
-    """Area [m^2], second moments about y and z and torsion constant [m^4] of one cross-section."""
+    """Area [m^2], second moments about y and z and torsion constant [m^4], and shear factors [-] of one cross-section."""
 
     area: Scalar
     moment_y: Scalar
     moment_z: Scalar
     torsion: Scalar
+    shear_factors: Float[Array, "2"]
 
 
 class Section(eqx.Module):
     """A cross-section whose sizes may vary along the arm.
 
-    **Shared arguments:**
+    **Arguments shared by the shapes:**
     - `torsion`: `"saint_venant"` takes the torsion constant of the shape, `"polar"` the polar moment $J_y + J_z$
       (the paper's choice). Both agree for circular and annular sections.
     - `shear_correction`: factors $(\\kappa_y, \\kappa_z)$ of the shear stiffness [-], one number for both; 1 in the paper.
     """
-
-    torsion: eqx.AbstractVar[Torsion]
-    shear_correction: eqx.AbstractVar[Float[Array, "2"]]
 
     @abstractmethod
     def geometry(self, X: Scalar, length: Scalar) -> Geometry:
@@ -56,6 +54,11 @@ class Section(eqx.Module):
     @abstractmethod
     def sizes(self) -> dict[str, Profile]:
         """The size profiles by name."""
+
+    @property
+    def breakpoints(self) -> tuple[Scalar, ...]:
+        """Abscissas [m] where a size or a derivative of it jumps."""
+        return tuple(x for size in self.sizes.values() for x in size.breakpoints)
 
 
 def _size(section: str, name: str, value: Any) -> Profile:
@@ -83,7 +86,7 @@ class Circular(Section):
     def geometry(self, X: Scalar, length: Scalar) -> Geometry:
         r = self.radius(X, length)
         moment = math.pi / 4 * r**4
-        return Geometry(math.pi * r**2, moment, moment, 2 * moment)
+        return Geometry(math.pi * r**2, moment, moment, 2 * moment, self.shear_correction)
 
     def clearance(self, y: Scalar, z: Scalar, X: Scalar, length: Scalar) -> Scalar:
         return self.radius(X, length) - jnp.sqrt(y**2 + z**2)
@@ -113,7 +116,7 @@ class Annular(Section):
     def geometry(self, X: Scalar, length: Scalar) -> Geometry:
         outer, inner = self.outer(X, length), self.inner(X, length)
         moment = math.pi / 4 * (outer**4 - inner**4)
-        return Geometry(math.pi * (outer**2 - inner**2), moment, moment, 2 * moment)
+        return Geometry(math.pi * (outer**2 - inner**2), moment, moment, 2 * moment, self.shear_correction)
 
     def clearance(self, y: Scalar, z: Scalar, X: Scalar, length: Scalar) -> Scalar:
         return self.outer(X, length) - jnp.sqrt(y**2 + z**2)
@@ -149,7 +152,7 @@ class Rectangular(Section):
         w, h = self.width(X, length), self.height(X, length)
         moment_y, moment_z = w * h**3 / 12, h * w**3 / 12
         torsion = moment_y + moment_z if self.torsion == "polar" else _rectangle_torsion(w, h)
-        return Geometry(w * h, moment_y, moment_z, torsion)
+        return Geometry(w * h, moment_y, moment_z, torsion, self.shear_correction)
 
     def clearance(self, y: Scalar, z: Scalar, X: Scalar, length: Scalar) -> Scalar:
         return jnp.minimum(self.width(X, length) / 2 - jnp.abs(y), self.height(X, length) / 2 - jnp.abs(z))
@@ -193,7 +196,7 @@ class Elliptic(Section):
         a, b = self.half_y(X, length), self.half_z(X, length)
         moment_y, moment_z = math.pi / 4 * a * b**3, math.pi / 4 * a**3 * b
         torsion = moment_y + moment_z if self.torsion == "polar" else math.pi * a**3 * b**3 / (a**2 + b**2)
-        return Geometry(math.pi * a * b, moment_y, moment_z, torsion)
+        return Geometry(math.pi * a * b, moment_y, moment_z, torsion, self.shear_correction)
 
     def clearance(self, y: Scalar, z: Scalar, X: Scalar, length: Scalar) -> Scalar:
         a, b = self.half_y(X, length), self.half_z(X, length)
@@ -207,36 +210,34 @@ class Elliptic(Section):
         return {"half_y": self.half_y, "half_z": self.half_z}
 
 
-class Material(eqx.Module):
-    """Linear elastic material.
+class Joined(Section):
+    """One section after another along the arm, with jumps between them.
 
     **Arguments:**
-    - `young`: Young's modulus $E$ [Pa].
-    - `shear` or `poisson`: the shear modulus $G$ [Pa], or Poisson's ratio $\\nu$ [-] for $G = E / (2 + 2\\nu)$; one of the two.
+    - `ends`: where each section but the last ends [m], rising.
+    - `sections`: one more than `ends`, of any shapes.
     """
 
-    young: Scalar
-    shear: Scalar | None
-    poisson: Scalar | None
+    ends: Float[Array, " inner"]
+    sections: tuple[Section, ...]
 
-    def __init__(self, young: Any, shear: Any = None, poisson: Any = None):
-        if (shear is None) == (poisson is None):
-            raise ValueError(f"Material: got shear={shear!r} and poisson={poisson!r}, need one of the two")
-        self.young = numbers("Material.young", young, positive=True)
-        self.shear = None if shear is None else numbers("Material.shear", shear, positive=True)
-        self.poisson = None if poisson is None else numbers("Material.poisson", poisson)
+    def __init__(self, ends: Any, sections: Sequence[Section]):
+        self.ends = rising_ends("Joined", ends, sections)
+        self.sections = tuple(instance(f"Joined.sections[{i}]", s, Section, "a section") for i, s in enumerate(sections))
+
+    def geometry(self, X: Scalar, length: Scalar) -> Geometry:
+        return pick(X, self.ends, [section.geometry(X, length) for section in self.sections])
+
+    def clearance(self, y: Scalar, z: Scalar, X: Scalar, length: Scalar) -> Scalar:
+        return pick(X, self.ends, [section.clearance(y, z, X, length) for section in self.sections])
+
+    def outline(self, angle: Array, X: Scalar, length: Scalar) -> tuple[Array, Array]:
+        return pick(X, self.ends, [section.outline(angle, X, length) for section in self.sections])
 
     @property
-    def shear_modulus(self) -> Scalar:
-        """Shear modulus $G$ [Pa]."""
-        if self.shear is not None:
-            return self.shear
-        assert self.poisson is not None
-        return self.young / (2 + 2 * self.poisson)
+    def sizes(self) -> dict[str, Profile]:
+        return {f"sections[{i}].{name}": size for i, section in enumerate(self.sections) for name, size in section.sizes.items()}
 
-    def stiffness(self, section: Section, X: Scalar, length: Scalar) -> Vector:
-        """Diagonal of $\\Sigma(X)$, six scalars [N m^2] and [N]."""
-        shape, E, G = section.geometry(X, length), self.young, self.shear_modulus
-        angular = (G * shape.torsion, E * shape.moment_y, E * shape.moment_z)
-        shear_y, shear_z = (kappa * G * shape.area for kappa in section.shear_correction)
-        return (*angular, E * shape.area, shear_y, shear_z)
+    @property
+    def breakpoints(self) -> tuple[Scalar, ...]:
+        return (*(end for end in self.ends), *(x for section in self.sections for x in section.breakpoints))
