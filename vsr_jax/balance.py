@@ -15,6 +15,7 @@ with $P = [-\tilde d, 1]$, is symmetric. Symbols, each a tuple of component arra
 - `tau` [N]: thread force, negative for a tendon; `reaction` $= \Lambda$ [N m, N].
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -26,6 +27,9 @@ from .component import Matrix, Vector, add, cholesky, cholesky_solve, dot, multi
 from .newton import Evaluation, newton
 from .routing import Path
 from .scene import CrossSections
+
+ALL = tuple(range(6))
+"""Places of all strains."""
 
 
 class Balance(NamedTuple):
@@ -111,14 +115,30 @@ def no_derivative(*values: Array) -> tuple[Any, ...]:
     return tuple(np.zeros(value.shape, jax.dtypes.float0) for value in values)
 
 
-@jax.custom_jvp
-def solve_balance(sections: CrossSections, tau: Vector, reaction: Vector | None = None) -> Balance:
+def chosen(vector: Vector, free: tuple[int, ...]) -> Vector:
+    """Components of the free strains."""
+    return tuple(vector[i] for i in free)
+
+
+def chosen_rows(lower: Matrix, free: tuple[int, ...]) -> Matrix:
+    """Lower triangle of a symmetric matrix that belongs to the free strains."""
+    return tuple(tuple(lower[i][j] for j in free if j <= i) for i in free)
+
+
+def spread(vector: Vector, free: tuple[int, ...]) -> Vector:
+    """Six components from those of the free strains, zero elsewhere."""
+    return tuple(vector[free.index(i)] if i in free else jnp.zeros_like(vector[0]) for i in range(6))
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(3,))
+def solve_balance(sections: CrossSections, tau: Vector, reaction: Vector | None = None, free: tuple[int, ...] = ALL) -> Balance:
     r"""Strain that balances each cross-section (eq. 21), by Newton's method from the rest strain.
 
     Where $H$ is not positive definite the step is $\Sigma^{-1} r$. Derivatives of any order are implicit,
     $d\xi = -H^{-1} dr$, in forward and reverse mode.
 
-    **Arguments:** component arrays of one shape; `reaction` is left out where there are no external loads.
+    **Arguments:** component arrays of one shape; `reaction` is left out where there are no external loads; `free`: places
+    of the strains that are solved for, the others keep their rest value.
 
     **Returns:** a `Balance`. `xi` is the last iterate whether or not it is balanced.
     """
@@ -130,32 +150,34 @@ def solve_balance(sections: CrossSections, tau: Vector, reaction: Vector | None 
     compliance = tuple(1 / s for s in stiffness)
 
     def evaluate(xi: Vector) -> Evaluation:
-        r = residual(xi, sections, tau, reaction)
-        elastic = multiply(compliance, r)
-        step = cholesky_solve(cholesky(tangent(xi, sections, tau)), r)
-        definite = ~jnp.isnan(step[5])
+        r = chosen(residual(xi, sections, tau, reaction), free)
+        elastic = multiply(chosen(compliance, free), r)
+        step = cholesky_solve(cholesky(chosen_rows(tangent(xi, sections, tau), free)), r)
+        definite = ~jnp.isnan(step[-1])
         step = tuple(jnp.where(definite, x, e) for x, e in zip(step, elastic, strict=True))
-        size = jnp.sqrt(dot(step, multiply(stiffness, step)) * compliance[3])
-        return Evaluation(step, size, jnp.sqrt(dot(r, elastic) * compliance[3]), definite)
+        size = jnp.sqrt(dot(step, multiply(chosen(stiffness, free), step)) * compliance[3])
+        return Evaluation(spread(step, free), size, jnp.sqrt(dot(r, elastic) * compliance[3]), definite)
 
     xi, definite, steps = newton(evaluate, rest, floor)
-    balanced = strain_norm(residual(xi, sections, tau, reaction), stiffness) <= 16 * floor
-    return Balance(xi, balanced, definite, steps)
+    imbalance = spread(chosen(residual(xi, sections, tau, reaction), free), free)
+    return Balance(xi, strain_norm(imbalance, stiffness) <= 16 * floor, definite, steps)
 
 
 @solve_balance.defjvp
-def _solve_balance_jvp(primals: tuple, tangents: tuple) -> tuple[Balance, Balance]:
+def _solve_balance_jvp(free: tuple[int, ...], primals: tuple, tangents: tuple) -> tuple[Balance, Balance]:
     sections, tau, reaction = primals
-    solution = solve_balance(sections, tau, reaction)
+    solution = solve_balance(sections, tau, reaction, free)
     # Where nothing was balanced there is no derivative: take it at rest without forces, where it is finite, so that no
     # other lane of a batch is harmed.
     sound = solution.balanced & solution.definite
     xi = tuple(jnp.where(sound, x, rest) for x, rest in zip(solution.xi, sections.rest, strict=True))
 
     def imbalance(sections: CrossSections, tau: Vector, reaction: Vector | None) -> Vector:
-        return residual(xi, sections, forces_where(sound, tau), reaction)
+        here = tuple(x if i in free else jnp.broadcast_to(sections.rest[i], x.shape) for i, x in enumerate(xi))
+        return residual(here, sections, forces_where(sound, tau), reaction)
 
     _, change = jax.jvp(imbalance, primals, tangents)
-    factor = cholesky(tangent(xi, sections, forces_where(sound, tau)))
-    d_xi = scale(-1.0, cholesky_solve(factor, change))
+    factor = cholesky(chosen_rows(tangent(xi, sections, forces_where(sound, tau)), free))
+    change = spread(scale(-1.0, cholesky_solve(factor, chosen(change, free))), free)
+    d_xi = tuple(x if i in free else jnp.broadcast_to(tangents[0].rest[i], x.shape) for i, x in enumerate(change))
     return solution, Balance(d_xi, *no_derivative(*solution[1:]))

@@ -166,6 +166,11 @@ class AbstractBasis(eqx.Module):
     def matrix(self, X: Scalar, length: Scalar) -> Float[Array, "6 dofs"]:
         """$B_q(X)$, shape (6, n)."""
 
+    @property
+    def strains(self) -> tuple[str, ...]:
+        """Names of the strains it frees."""
+        return STRAINS
+
     def breakpoints(self, length: Scalar) -> tuple[Scalar, ...]:
         """Abscissas [m] where the basis or a derivative of it jumps."""
         return ()
@@ -190,6 +195,10 @@ class Basis(AbstractBasis):
         if not families:
             raise ValueError("Basis: got no strain, need at least one")
         self.families = dict(families)
+
+    @property
+    def strains(self) -> tuple[str, ...]:
+        return tuple(self.families)
 
     @classmethod
     def uniform(cls, family: Family, strains: tuple[str, ...] = STRAINS) -> "Basis":

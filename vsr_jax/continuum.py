@@ -1,4 +1,4 @@
-r"""The continuous Cosserat model (eq. 12), integrated by diffrax from the tip, where $F_i(L) = F_a(L)$, to the base."""
+r"""The continuous Cosserat model (eq. 12), integrated by diffrax: without loads from the tip, where $F_i(L) = F_a(L)$, to the base."""
 
 from typing import Any, NamedTuple
 
@@ -11,20 +11,23 @@ from jaxtyping import Array, Float
 from . import component as c
 from ._check import count, instance, numbers
 from ._types import Pose, Scalar, Twist
-from .balance import forces_where, residual, rounding_floor, solve_balance, strain_norm, tangent
+from .balance import ALL, forces_where, residual, rounding_floor, solve_balance, strain_norm, tangent
 from .component import Vector
-from .model import Model, Outcome, Status, classify
-from .quadrature import Grid
+from .coupled import shares_at
+from .model import Model, Nodes, Outcome, Status, classify
+from .quadrature import locate, make_grid
+from .reaction import loading, react_at
 from .scene import CrossSections, Scene
 from .se3 import coad, hat, inverse
+from .shooting import Control, Guess, Line, Shot, Unknown, integrate, shoot
 from .strain_dependent import StrainDependent
 
 
-class Line(NamedTuple):
-    """What is integrated: the strain and the pose relative to the tip's frame."""
+class Found(NamedTuple):
+    """What is kept of a solution: the tip's pose relative to the base, and the inputs."""
 
-    xi: Twist
-    g: Pose
+    tip: Pose
+    inputs: Array
 
 
 def strain_rate(scene: Scene, tau: Vector, xi: Twist, X: Scalar) -> Twist:
@@ -46,7 +49,7 @@ def strain_rate(scene: Scene, tau: Vector, xi: Twist, X: Scalar) -> Twist:
 
 
 class Continuum(Model):
-    """The continuous model as an initial value problem in X.
+    """The continuous model: an initial value problem in X, or with loads or jumps a boundary value problem (see `shooting`).
 
     Derivatives are implicit. The solution of eq. (8) satisfies the balance (21) at every X, so its exact derivative is
     that of the balance, which `derivative`, a `StrainDependent` model, carries to the poses; the adaptive integration is
@@ -56,13 +59,16 @@ class Continuum(Model):
     - `solver`: a diffrax solver, `diffrax.Dopri8()` by default.
     - `rtol`, `atol`: tolerances of the step size control, at least four times the machine's epsilon.
     - `max_steps`: bound on the number of steps.
-    - `derivative`: the steps on which derivatives are computed.
+    - `segments`: of the multiple shooting, for arms with loads, jumps, given thread lengths or friction.
+    - `derivative`: the steps on which derivatives are computed. Where there is shooting they give the first guess as well, and
+      the tensions that thread lengths and friction call for.
     """
 
     solver: diffrax.AbstractSolver
     rtol: float = eqx.field(static=True)
     atol: float = eqx.field(static=True)
     max_steps: int = eqx.field(static=True)
+    segments: int = eqx.field(static=True)
     derivative: StrainDependent
 
     def __init__(
@@ -71,6 +77,7 @@ class Continuum(Model):
         rtol: float = 1e-8,
         atol: float = 1e-10,
         max_steps: int = 4096,
+        segments: int = 8,
         derivative: StrainDependent | None = None,
     ):
         chosen = diffrax.Dopri8() if solver is None else solver
@@ -78,35 +85,51 @@ class Continuum(Model):
         self.rtol = float(numbers("Continuum.rtol", rtol, positive=True))
         self.atol = float(numbers("Continuum.atol", atol, positive=True))
         self.max_steps = count("Continuum.max_steps", max_steps)
+        self.segments = count("Continuum.segments", segments)
         steps = StrainDependent(64) if derivative is None else derivative
         self.derivative = instance("Continuum.derivative", steps, StrainDependent, "a StrainDependent model")
 
     def solve(self, scene: Scene, inputs: Float[Array, " inputs"]) -> Outcome:
-        tip, status, steps = _tip(self, scene, inputs)
-        return Outcome(tip, status, steps)
+        tip, forces, status, steps = _tip(self, scene, inputs)
+        return Outcome(Found(tip, inputs), forces, status, steps)
 
-    def strain(self, scene: Scene, inputs: Float[Array, " inputs"], state: Pose, X: Float[Array, " stations"]) -> Vector:
-        return c.split(_line(self, scene, inputs, X).xi)
+    def strain(self, scene: Scene, forces: Vector, state: Found, X: Float[Array, " stations"]) -> Vector:
+        return c.split(_line(self, scene, state.inputs, X).xi)
 
-    def tip(self, scene: Scene, inputs: Float[Array, " inputs"], state: Pose) -> Pose:
-        return _from_base(scene, state)
+    def tip(self, scene: Scene, forces: Vector, state: Found) -> Pose:
+        return _from_base(scene, state.tip)
 
-    def poses(
-        self, scene: Scene, inputs: Float[Array, " inputs"], state: Any, X: Float[Array, " stations"]
-    ) -> Float[Array, "stations 4 4"]:
-        return _from_base(scene, _line(self, scene, inputs, X).g)
+    def poses(self, scene: Scene, forces: Vector, state: Found, X: Float[Array, " stations"]) -> Float[Array, "stations 4 4"]:
+        return _from_base(scene, _line(self, scene, state.inputs, X).g)
 
-    def grid(self, scene: Scene) -> Grid:
-        return self.derivative.grid(scene)
+    def nodes(self, scene: Scene, forces: Vector, state: Found) -> Nodes:
+        grid = self.derivative.grid(scene)
+        xi = tuple(x.reshape(grid.X.shape) for x in self.strain(scene, forces, state, grid.X.reshape(-1)))
+        turning = self.derivative.solve(scene, state.inputs).state.turning if scene.rubbing else ()
+        return Nodes(grid, xi, scene.sections(grid.X), shares_at(scene, turning, grid, grid.X))
+
+    def _control(self, dtype: Any) -> Control:
+        finest = 4 * float(jnp.finfo(dtype).eps)
+        return Control(self.solver, max(self.rtol, finest), max(self.atol, finest), self.max_steps)
 
 
 def _from_base(scene: Scene, g: Array) -> Array:
     return g if scene.rod.base is None else scene.rod.base @ g
 
 
+def _initial_value(scene: Scene) -> bool:
+    """Whether the arm can be integrated in one go: no loads, nothing that jumps, all strains free."""
+    return not scene.coupled and not scene.breakpoints and scene.free == ALL
+
+
 @eqx.filter_custom_jvp
-def _tip(model: Continuum, scene: Scene, inputs: Array) -> tuple[Pose, Array, Array]:
-    """Pose of the tip relative to the base, the status and the number of steps."""
+def _tip(model: Continuum, scene: Scene, inputs: Array) -> tuple[Pose, Vector, Array, Array]:
+    """Pose of the tip relative to the base, the thread forces, the status and the number of steps."""
+    if not _initial_value(scene):
+        shot, guess, status = _shoot(model, scene, inputs)
+        sound = status == Status.CONVERGED
+        tip = jnp.where(sound, _relative(scene, shot.poses[-1]), jnp.eye(4, dtype=shot.poses.dtype))
+        return tip, forces_where(sound, guess.forces), status, shot.steps.astype(jnp.int32)
     ys, status, steps = _integrate(model, scene, inputs, diffrax.SaveAt(t1=True))
     line = jax.tree.map(lambda y: y[0], ys)
     tau, sections = scene.forces(inputs), scene.sections(jnp.zeros_like(scene.rod.length))
@@ -115,22 +138,24 @@ def _tip(model: Continuum, scene: Scene, inputs: Array) -> tuple[Pose, Array, Ar
     balanced = imbalance <= rounding_floor(sections.stiffness, tau) + 100 * (model.rtol + model.atol) ** 0.5
     status = jnp.where((status == Status.CONVERGED) & ~balanced, Status.MAX_STEPS, status).astype(jnp.int32)
     tip = jnp.where(status == Status.CONVERGED, inverse(line.g), jnp.eye(4, dtype=line.g.dtype))
-    return tip, status, steps
+    return tip, tau, status, steps
 
 
 @_tip.def_jvp
 def _tip_jvp(primals: tuple, tangents: tuple) -> tuple:
-    def derivative(model: Continuum, scene: Scene, inputs: Array) -> Pose:
-        origin = _at_origin(scene)
-        return model.derivative.tip(origin, inputs, model.derivative.solve(origin, inputs).state)
+    def derivative(model: Continuum, scene: Scene, inputs: Array) -> tuple[Pose, Vector]:
+        found = model.derivative.solve(scene, inputs)
+        return model.derivative.tip(_at_origin(scene), found.forces, found.state), found.forces
 
     _, change = eqx.filter_jvp(derivative, primals, tangents)
-    return _tip(*primals), (change, None, None)
+    return _tip(*primals), (*change, None, None)
 
 
 @eqx.filter_custom_jvp
 def _line(model: Continuum, scene: Scene, inputs: Array, X: Array) -> Line:
     """Strain and pose relative to the base at abscissas X in any order."""
+    if not _initial_value(scene):
+        return _line_of_shot(model, scene, inputs, X)
     order = jnp.argsort(-X)
     line, _, _ = _integrate(model, scene, inputs, diffrax.SaveAt(ts=jnp.append(X[order], 0.0)))
     from_base = inverse(line.g[-1]) @ line.g[:-1]
@@ -141,11 +166,50 @@ def _line(model: Continuum, scene: Scene, inputs: Array, X: Array) -> Line:
 def _line_jvp(primals: tuple, tangents: tuple) -> tuple[Line, Line]:
     def derivative(model: Continuum, scene: Scene, inputs: Array, X: Array) -> Line:
         steps, origin = model.derivative, _at_origin(scene)
-        state = steps.solve(origin, inputs).state
-        return Line(c.join(steps.strain(origin, inputs, state, X)), steps.poses(origin, inputs, state, X))
+        found = steps.solve(scene, inputs)
+        xi = c.join(steps.strain(scene, found.forces, found.state, X))
+        return Line(xi, steps.poses(origin, found.forces, found.state, X))
 
     _, change = eqx.filter_jvp(derivative, primals, tangents)
     return _line(*primals), change
+
+
+def _relative(scene: Scene, g: Array) -> Array:
+    """Poses relative to the base from poses in a world frame at the base's place."""
+    if scene.rod.base is None:
+        return g
+    turn = jnp.eye(4, dtype=g.dtype).at[:3, :3].set(scene.rod.base[:3, :3].T)
+    return turn @ g
+
+
+def _shoot(model: Continuum, scene: Scene, inputs: Array) -> tuple[Shot, Guess, Array]:
+    """Multiple shooting from the solution on the steps of `derivative`, and the status."""
+    steps = model.derivative
+    found = steps.solve(scene, inputs)
+    grid, segments = steps.grid(scene), make_grid(scene.edges(), model.segments, 1)
+    guess = Guess(grid, found.forces, found.state.turning)
+    loads = loading(scene, grid)
+    zero = jnp.zeros_like(segments.start)
+    wrench = (zero,) * 6 if loads is None else react_at(found.state.xi, grid, loads, segments.start)
+    first = Unknown(steps.poses(scene, found.forces, found.state, segments.start)[:, :3, :3], c.join(wrench))
+    control = model._control(grid.h.dtype)
+    shot = shoot(scene, guess, first, segments, control, 100 * max(control.rtol, control.atol))
+    failed = jnp.where(found.status == Status.CONVERGED, Status.MAX_STEPS, found.status)
+    return shot, guess, jnp.where(shot.fits & (found.status == Status.CONVERGED), Status.CONVERGED, failed).astype(jnp.int32)
+
+
+def _line_of_shot(model: Continuum, scene: Scene, inputs: Array, X: Array) -> Line:
+    shot, guess, _ = _shoot(model, scene, inputs)
+    segments, control = shot.segments, model._control(X.dtype)
+    segment, part = locate(segments, X)
+
+    def at(j: Array, part: Array) -> Line:
+        rotation, reaction = shot.unknown.rotation[j], shot.unknown.reaction[j]
+        line, _, _ = integrate(scene, guess, control, segments.start[j], segments.h[j], rotation, reaction, part)
+        return Line(line.xi, shot.poses[j] @ line.g)
+
+    line = jax.vmap(at)(segment, part)
+    return Line(line.xi, _relative(scene, line.g))
 
 
 def _at_origin(scene: Scene) -> Scene:

@@ -7,16 +7,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from . import component as c
+from . import component as c, galerkin
 from ._check import choice, count, instance
 from ._types import Scalar
 from .balance import forces_where, no_derivative, residual, rounding_floor, tangent, thread_direction, thread_wrench
 from .basis import AbstractBasis
 from .component import Vector
+from .coupled import problem_of, with_tensions
+from .galerkin import solve_prescribed
 from .kinematics import ORDERS, accumulate_jacobian
-from .model import Outcome, SteppedModel, classify
+from .model import Nodes, Outcome, Status, SteppedModel, classify
 from .newton import Evaluation, newton
-from .quadrature import make_grid
+from .quadrature import Grid, make_grid
 from .scene import CrossSections, Scene
 
 
@@ -108,8 +110,11 @@ class Prescribed(SteppedModel):
 
     **Arguments:**
     - `basis`: an `AbstractBasis`, such as `Basis.uniform(Legendre(4))`.
-    - `points`: Gauss points of the quadrature of $K$ and $B(q)$ on each smooth piece of the arm.
+    - `points`: Gauss points of the quadrature of $K$ and $B(q)$ on each smooth piece of the arm. With loads, given thread
+      lengths or friction the quadrature is that of the pose steps instead.
     - `steps`, `order`: pose steps as for `StrainDependent`.
+
+    **Raises:** `ValueError` on solving a scene that locks a strain the basis frees.
     """
 
     basis: AbstractBasis
@@ -127,20 +132,66 @@ class Prescribed(SteppedModel):
         return self.basis.breakpoints(scene.rod.length)
 
     def solve(self, scene: Scene, inputs: Float[Array, " inputs"]) -> Outcome:
-        projection = project(scene, self.basis, self.points)
-        tau = scene.forces(inputs)
+        self._check_strains(scene)
+        if scene.coupled:
+            return self._solve_together(scene, inputs)
+        projection, forces = project(scene, self.basis, self.points), scene.forces(inputs)
+        tau = projection.sections.carry(forces)
         q, balanced, definite, steps = solve_projected(projection, tau)
         status = classify(projection.strain(q), projection.sections, tau, balanced, definite)
-        return Outcome(jnp.where(status == 0, q, 0.0), status, steps)
+        return Outcome(jnp.where(status == Status.CONVERGED, q, 0.0), forces, status, steps)
 
-    def coordinates(self, scene: Scene, inputs: Float[Array, " inputs"], state: Array) -> Float[Array, " dofs"]:
+    def _solve_together(self, scene: Scene, inputs: Float[Array, " inputs"]) -> Outcome:
+        problem, kind = problem_of(scene, inputs, self.grid(scene))
+        basis = self._at_nodes(scene, problem.grid)
+        (q, tensions), balanced, definite, steps = solve_prescribed(basis, problem, kind)
+        forces = with_tensions(problem.forces, tensions, kind)
+        xi = galerkin.strain(q, basis, problem)
+        tau = problem.sections.carry(forces)
+        status = classify(xi, problem.sections, tau, balanced, definite, loaded=bool(scene.loads))
+        sound = status == Status.CONVERGED
+        return Outcome(jnp.where(sound, q, 0.0), forces_where(sound, forces), status, steps)
+
+    def _at_nodes(self, scene: Scene, grid: Grid) -> galerkin.Basis:
+        X = grid.X.reshape(-1)
+
+        def at(x: Scalar) -> Array:
+            return self.basis.matrix(x, scene.rod.length)
+
+        def with_rate(x: Scalar) -> tuple[Array, Array]:
+            return jax.jvp(at, (x,), (jnp.ones_like(x),))
+
+        matrix, rate = jax.vmap(with_rate)(X) if scene.rubbing else (jax.vmap(at)(X), None)
+        shape = (*grid.X.shape, 6, self.basis.size)
+        return galerkin.Basis(matrix.reshape(shape), None if rate is None else rate.reshape(shape))
+
+    def _check_strains(self, scene: Scene) -> None:
+        freed = self.basis.strains
+        locked = [name for name in freed if name not in scene.free_strains]
+        if locked:
+            raise ValueError(
+                f"Prescribed.basis: got one that frees {', '.join(locked)}, need only {', '.join(scene.free_strains)}, as the scene"
+            )
+
+    def coordinates(self, scene: Scene, forces: Vector, state: Array) -> Float[Array, " dofs"]:
         return state
 
-    def node_strain(self, scene: Scene, inputs: Float[Array, " inputs"], state: Array) -> Vector:
+    def node_strain(self, scene: Scene, state: Array) -> Vector:
         X = self.grid(scene).X
-        return tuple(x.reshape(X.shape) for x in self.strain(scene, inputs, state, X.reshape(-1)))
+        return tuple(x.reshape(X.shape) for x in self._strain(scene, state, X.reshape(-1)))
 
-    def strain(self, scene: Scene, inputs: Float[Array, " inputs"], state: Any, X: Float[Array, " stations"]) -> Vector:
+    def nodes(self, scene: Scene, forces: Vector, state: Array) -> Nodes:
+        grid = self.grid(scene)
+        xi, sections = self.node_strain(scene, state), scene.sections(grid.X)
+        if not scene.rubbing:
+            return Nodes(grid, xi, sections, sections.reach)
+        problem, kind = problem_of(scene, jnp.zeros(len(scene.actuators), grid.h.dtype), grid)
+        return Nodes(grid, xi, sections, galerkin.shares(xi, state, self._at_nodes(scene, grid), problem, kind))
+
+    def strain(self, scene: Scene, forces: Vector, state: Array, X: Float[Array, " stations"]) -> Vector:
+        return self._strain(scene, state, X)
+
+    def _strain(self, scene: Scene, state: Array, X: Float[Array, " stations"]) -> Vector:
         def at(x: Scalar) -> Vector:
             return c.add(c.split(self.basis.matrix(x, scene.rod.length) @ state), scene.rod.rest(x))
 

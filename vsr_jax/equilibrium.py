@@ -9,9 +9,13 @@ from jaxtyping import Array, Bool, Float
 from . import component as c
 from ._check import is_traced
 from ._types import Pose, Scalar
-from .balance import tangent, thread_direction
-from .model import Model, Outcome, Status
+from .balance import forces_where
+from .cable import cable_of, path_length
+from .component import Vector
+from .model import Model, Nodes, Outcome, Status
+from .reaction import loading, react_at
 from .scene import Scene
+from .stability import margin
 
 
 class Equilibrium(eqx.Module):
@@ -29,11 +33,12 @@ class Equilibrium(eqx.Module):
     model: Model
     status: Array
     steps: Array
+    _forces: Vector
     _state: Any
 
     def __init__(self, scene: Scene, inputs: Float[Array, " inputs"], model: Model, outcome: Outcome):
         self.scene, self.inputs, self.model = scene, inputs, model
-        self._state, self.status, self.steps = outcome
+        self._state, self._forces, self.status, self.steps = outcome
 
     @property
     def converged(self) -> Bool[Array, "..."]:
@@ -49,7 +54,7 @@ class Equilibrium(eqx.Module):
     def q(self) -> Float[Array, " dofs"]:
         """Coordinates of the strain in the model's basis: those of `Prescribed`, the thread forces (eq. 20) for `StrainDependent`."""
         self._refuse_batch()
-        return self._mask(self.model.coordinates(self.scene, self._sound_inputs, self._state))
+        return self._mask(self.model.coordinates(self.scene, self._sound_forces, self._state))
 
     @property
     def tip(self) -> Pose:
@@ -71,9 +76,12 @@ class Equilibrium(eqx.Module):
 
     @property
     def stability(self) -> Scalar:
-        r"""Margin of stability: the least eigenvalue of $\Sigma^{-1/2} (\Sigma - A) \Sigma^{-1/2}$ over the nodes.
+        r"""Margin of stability: the least eigenvalue of $\Sigma^{-1/2} (\Sigma - A) \Sigma^{-1/2}$ over the nodes; where loads or
+        given lengths tie the nodes to each other, of the whole tangent scaled the same way (its symmetric part).
 
         1 for an arm without forces, at least 1 for tendons alone up to rounding, 0 where the equilibrium ceases to be stable.
+        Loads that have no potential (dead moments in space, follower loads) leave a part that is not symmetric: with them a
+        margin below 0 does not prove instability.
         """
         self._refuse_batch()
         return self._stability()
@@ -83,6 +91,22 @@ class Equilibrium(eqx.Module):
         """Length of each thread's path, $l_i = \\int |t_{ci}| dX$ [m]."""
         self._refuse_batch()
         return self._lengths()
+
+    @property
+    def forces(self) -> Float[Array, " threads"]:
+        r"""Signed force $\tau$ [N] of each thread at its start: minus the tension of a tendon, given or found."""
+        self._refuse_batch()
+        return self._mask(jnp.array(self._sound_forces, self.inputs.dtype))
+
+    @property
+    def slack(self) -> Float[Array, " threads"]:
+        """Length of cable [m] that hangs loose in each tendon driven by its length; zero while it is taut, and for all others."""
+        self._refuse_batch()
+        return self._slack()
+
+    def reaction(self, X: Any) -> Float[Array, "... 6"]:
+        r"""Wrench $\Lambda(X) = (M\,[N m], N\,[N])$ in the body frame that the loads beyond X ask of rod and threads together."""
+        return self._reaction(self._abscissas(X))
 
     def thread(self, index: int, X: Any) -> Float[Array, "... 3"]:
         """Position [m] of thread `index` where it crosses the sections at X: $r + R d$."""
@@ -97,8 +121,8 @@ class Equilibrium(eqx.Module):
         return f"Equilibrium(model={type(self.model).__name__}, converged, tip=({x:.6g}, {y:.6g}, {z:.6g}) m)"
 
     @property
-    def _sound_inputs(self) -> Array:
-        return jnp.where(self.converged, self.inputs, 0.0)
+    def _sound_forces(self) -> Vector:
+        return forces_where(self.converged, self._forces)
 
     def _mask(self, value: Array) -> Array:
         return jnp.where(self.converged, value, jnp.nan)
@@ -118,11 +142,11 @@ class Equilibrium(eqx.Module):
 
     @eqx.filter_jit
     def _tip(self) -> Pose:
-        return self._mask(self.model.tip(self.scene, self._sound_inputs, self._state))
+        return self._mask(self.model.tip(self.scene, self._sound_forces, self._state))
 
     @eqx.filter_jit
     def _poses(self, X: Array) -> Array:
-        poses = self.model.poses(self.scene, self._sound_inputs, self._state, jnp.atleast_1d(X))
+        poses = self.model.poses(self.scene, self._sound_forces, self._state, jnp.atleast_1d(X))
         return self._mask(poses.reshape(*X.shape, 4, 4))
 
     @eqx.filter_jit
@@ -132,23 +156,39 @@ class Equilibrium(eqx.Module):
 
     @eqx.filter_jit
     def _strain(self, X: Array) -> Array:
-        strain = self.model.strain(self.scene, self._sound_inputs, self._state, jnp.atleast_1d(X))
+        strain = self.model.strain(self.scene, self._sound_forces, self._state, jnp.atleast_1d(X))
         return self._mask(c.join(strain).reshape(*X.shape, 6))
 
-    def _along(self) -> tuple:
-        grid = self.model.grid(self.scene)
-        X = grid.X.reshape(-1)
-        return self.model.strain(self.scene, self._sound_inputs, self._state, X), self.scene.sections(X), grid.weight.reshape(-1)
+    def _nodes(self) -> Nodes:
+        return self.model.nodes(self.scene, self._sound_forces, self._state)
 
-    @eqx.filter_jit
-    def _stability(self) -> Scalar:
-        xi, sections, _ = self._along()
-        lower = tangent(xi, sections, self.scene.forces(self._sound_inputs))
-        root = jnp.sqrt(c.join(sections.stiffness))
-        scaled = c.join_matrix(c.symmetric(lower)) / (root[:, :, None] * root[:, None, :])
-        return self._mask(jnp.min(jnp.linalg.eigvalsh(scaled)))
+    def _path_lengths(self, nodes: Nodes) -> Array:
+        places = range(len(self.scene.actuators))
+        return jnp.array([path_length(nodes.xi, nodes.sections, i, nodes.grid) for i in places], self.inputs.dtype)
 
     @eqx.filter_jit
     def _lengths(self) -> Array:
-        xi, sections, weight = self._along()
-        return self._mask(jnp.array([jnp.sum(weight * thread_direction(xi, path)[1]) for path in sections.paths], weight.dtype))
+        return self._mask(self._path_lengths(self._nodes()))
+
+    @eqx.filter_jit
+    def _slack(self) -> Array:
+        nodes, scene = self._nodes(), self.scene
+        lengths, slack = self._path_lengths(nodes), jnp.zeros_like(self.inputs)
+        for place in scene.length_driven:
+            cable = cable_of(scene, self.inputs[place], place, nodes.sections, nodes.grid)
+            tension = -self._sound_forces[place]
+            loose = cable.slack(tension, lengths[place], nodes.shares[place], nodes.grid)
+            slack = slack.at[place].set(jnp.where(tension > 0, 0.0, loose))
+        return self._mask(slack)
+
+    @eqx.filter_jit
+    def _stability(self) -> Scalar:
+        return self._mask(margin(self.scene, self._sound_forces, self._nodes()))
+
+    @eqx.filter_jit
+    def _reaction(self, X: Array) -> Array:
+        nodes = self._nodes()
+        loads = loading(self.scene, nodes.grid)
+        if loads is None:
+            return self._mask(jnp.zeros((*X.shape, 6), X.dtype))
+        return self._mask(c.join(react_at(nodes.xi, nodes.grid, loads, X)))

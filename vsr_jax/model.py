@@ -44,10 +44,25 @@ _MESSAGES = {
 }
 
 
+class Nodes(NamedTuple):
+    """A grid and, at its nodes, the strain, the cross-sections and the share of each thread's force (None for all of it)."""
+
+    grid: Grid
+    xi: Vector
+    sections: CrossSections
+    shares: tuple[Array | None, ...]
+
+    def tau(self, forces: Vector) -> Vector:
+        """Force of each thread at the nodes."""
+        return tuple(f if share is None else f * share for f, share in zip(forces, self.shares, strict=True))
+
+
 class Outcome(NamedTuple):
-    """What a model's solve hands back: its own state (finite even where it failed), a `Status` and the Newton steps."""
+    """What a model's solve hands back: its own state (finite even where it failed), the thread forces [N] at their start, a
+    `Status` and the Newton steps."""
 
     state: Any
+    forces: Vector
     status: Array
     steps: Array
 
@@ -60,26 +75,24 @@ class Model(eqx.Module):
         """Equilibrium for admissible inputs."""
 
     @abstractmethod
-    def strain(self, scene: Scene, inputs: Float[Array, " inputs"], state: Any, X: Float[Array, " stations"]) -> Vector:
+    def strain(self, scene: Scene, forces: Vector, state: Any, X: Float[Array, " stations"]) -> Vector:
         r"""Strain $\xi$ at abscissas X, six component arrays."""
 
     @abstractmethod
-    def tip(self, scene: Scene, inputs: Float[Array, " inputs"], state: Any) -> Pose:
+    def tip(self, scene: Scene, forces: Vector, state: Any) -> Pose:
         """Pose of the arm's end."""
 
     @abstractmethod
-    def poses(
-        self, scene: Scene, inputs: Float[Array, " inputs"], state: Any, X: Float[Array, " stations"]
-    ) -> Float[Array, "stations 4 4"]:
+    def poses(self, scene: Scene, forces: Vector, state: Any, X: Float[Array, " stations"]) -> Float[Array, "stations 4 4"]:
         """Poses at abscissas X."""
 
-    def coordinates(self, scene: Scene, inputs: Float[Array, " inputs"], state: Any) -> Float[Array, " dofs"]:
+    def coordinates(self, scene: Scene, forces: Vector, state: Any) -> Float[Array, " dofs"]:
         """Coordinates of the strain in the model's basis."""
         raise ValueError(f"q: got a solution by {type(self).__name__}, need one by StrainDependent or Prescribed")
 
     @abstractmethod
-    def grid(self, scene: Scene) -> Grid:
-        """Steps and nodes on which quantities along the arm are summed."""
+    def nodes(self, scene: Scene, forces: Vector, state: Any) -> Nodes:
+        """What quantities along the arm are summed from."""
 
 
 class SteppedModel(Model):
@@ -88,49 +101,50 @@ class SteppedModel(Model):
     steps: eqx.AbstractVar[int]
     order: eqx.AbstractVar[int]
 
-    @abstractmethod
-    def node_strain(self, scene: Scene, inputs: Float[Array, " inputs"], state: Any) -> Vector:
-        """Strain at the nodes of `grid`, six component arrays of shape (stages, steps)."""
-
     def breakpoints(self, scene: Scene) -> tuple[Array, ...]:
         """Abscissas [m] where steps break besides those of the scene."""
         return ()
 
     def grid(self, scene: Scene) -> Grid:
+        """Steps along the arm and their nodes."""
         return make_grid(scene.edges(self.breakpoints(scene)), self.steps, self.order // 2)
 
-    def tip(self, scene: Scene, inputs: Float[Array, " inputs"], state: Any) -> Pose:
-        return tip_pose(self.node_strain(scene, inputs, state), self.grid(scene).h, scene.rod.base)
+    def tip(self, scene: Scene, forces: Vector, state: Any) -> Pose:
+        return tip_pose(self.node_strain(scene, state), self.grid(scene).h, scene.rod.base)
 
-    def poses(
-        self, scene: Scene, inputs: Float[Array, " inputs"], state: Any, X: Float[Array, " stations"]
-    ) -> Float[Array, "stations 4 4"]:
+    @abstractmethod
+    def node_strain(self, scene: Scene, state: Any) -> Vector:
+        """Strain at the nodes of `grid`, six component arrays of shape (stages, steps)."""
+
+    def poses(self, scene: Scene, forces: Vector, state: Any, X: Float[Array, " stations"]) -> Float[Array, "stations 4 4"]:
         grid = self.grid(scene)
-        ends = step_poses(self.node_strain(scene, inputs, state), grid.h, scene.rod.base)
+        ends = step_poses(self.node_strain(scene, state), grid.h, scene.rod.base)
         step = jnp.clip(jnp.searchsorted(grid.start, X, side="right") - 1, 0, grid.start.size - 1)
         h = X - grid.start[step]
         nodes = gauss_legendre(self.order // 2)[0].astype(h.dtype)
         X_nodes = grid.start[step] + nodes[:, None] * h
-        strain = self.strain(scene, inputs, state, X_nodes.reshape(-1))
+        strain = self.strain(scene, forces, state, X_nodes.reshape(-1))
         stages = tuple(tuple(x.reshape(X_nodes.shape)[i] for x in strain) for i in range(len(nodes)))
         return jax.vmap(jnp.matmul)(ends[step], pose(*exp_components(step_components(stages, h))))
 
 
-def classify(xi: Vector, sections: CrossSections, tau: Vector, balanced: Array, definite: Array) -> Array:
+def classify(xi: Vector, sections: CrossSections, tau: Vector, balanced: Array, definite: Array, *, loaded: bool = False) -> Array:
     """`Status` from the strain, whether it balances and whether the tangent is positive definite, over all nodes.
 
-    With tendons alone the energy is convex, so a node that cannot be balanced has its least energy at a kink, where the
-    path of a thread has no length left: it has collapsed. So has a node where a path, or the axis, has turned over.
+    With tendons alone (not `loaded`) the energy is convex, so a node that cannot be balanced has its least energy at a kink,
+    where the path of a thread has no length left: it has collapsed. So has a node where a path, or the axis, has turned over.
     """
-    pulling = jnp.all(jnp.stack([force <= 0 for force in tau])) if tau else jnp.array(False)
+    pulling = jnp.all(jnp.stack([jnp.all(force <= 0) for force in tau])) if tau and not loaded else jnp.array(False)
     left = xi[3] / sections.rest[3]
-    for path in sections.paths:
+    for path, reach in zip(sections.paths, sections.reach, strict=True):
         rest = thread_tangent(sections.rest, path)
-        left = jnp.minimum(left, dot(thread_tangent(xi, path), rest) / dot(rest, rest))
+        share = dot(thread_tangent(xi, path), rest) / dot(rest, rest)
+        left = jnp.minimum(left, share if reach is None else jnp.where(reach > 0, share, 1.0))
     finite = jnp.all(jnp.isfinite(sum(xi)))
     collapsed = jnp.any(~balanced & pulling) | jnp.any(left <= 0)
     status = jnp.where(jnp.all(balanced), Status.CONVERGED, Status.MAX_STEPS)
-    status = jnp.where(jnp.all(definite), status, Status.UNSTABLE)
+    lost = ~jnp.all(definite)
+    status = jnp.where(lost & jnp.all(balanced) if loaded else lost, Status.UNSTABLE, status)
     status = jnp.where(collapsed, Status.COLLAPSED, status)
     return jnp.where(finite, status, Status.NOT_FINITE).astype(jnp.int32)
 

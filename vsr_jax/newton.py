@@ -9,7 +9,10 @@ from jax import lax
 from jaxtyping import Array
 
 MAX_STEPS = 50
+MAX_DAMPED_STEPS = 200
 _LEAST_FRACTION = 1e-6
+_LEAST_DAMPING, _MOST_DAMPING = 0.1, 1e8
+_RAISE, _LOWER = 10.0, 30.0
 
 
 class Evaluation(NamedTuple):
@@ -62,3 +65,65 @@ def newton(evaluate: Callable[[Any], Evaluation], start: Any, floor: Array) -> R
     first = Evaluation(still, jnp.zeros_like(merit), merit, jnp.ones(merit.shape, bool))
     x, at, _, count = lax.while_loop(proceed, advance, (start, first, jnp.ones_like(merit), jnp.zeros((), jnp.int32)))
     return Root(jax.tree.map(jnp.subtract, x, at.step), at.definite, count)
+
+
+class Damped(NamedTuple):
+    """What `damped_newton` learns at a point for one damping: the step to subtract, its size, the residual, its size, and
+    whether the damped tangent is positive definite there."""
+
+    step: Any
+    size: Array
+    residual: Any
+    merit: Array
+    definite: Array
+
+
+def damped_newton(
+    evaluate: Callable[[Any, Array], Damped], work: Callable[[Any, Any], Array], start: Any, floor: Array
+) -> tuple[Any, Damped, Array]:
+    r"""Root of a residual that is the gradient of an energy, or nearly so, by Newton's method with Levenberg's damping.
+
+    The tangent is $H + \mu \Sigma$: a short step in implicit time of an arm that creeps. $\mu$ rises until the tangent is
+    positive definite, and falls with every step taken. A step is taken if the residual does not push back over it more
+    than it pulled, $r(x + s) \cdot s \le -r(x) \cdot s$, so that the energy falls, or if the residual has become smaller.
+    The tangent may be approximate: the end is reached when an undamped step is negligible, without taking it, so that the
+    residual returned is that of the point returned.
+
+    **Arguments:**
+    - `evaluate`: maps a point and a damping $\mu$ to `Damped`.
+    - `work`: scalar product of a residual and a step.
+    - `floor`: size of the residual that counts as rounding.
+
+    **Returns:** the point, what `evaluate` said of it, and the number of evaluations.
+    """
+    small = jnp.finfo(floor.dtype).eps ** 0.75
+
+    def raised(mu: Array) -> Array:
+        return jnp.maximum(_RAISE * mu, _LEAST_DAMPING)
+
+    def lowered(mu: Array) -> Array:
+        return jnp.where(mu > 1e-2 * _LEAST_DAMPING, mu / _LOWER, 0.0)
+
+    def proceed(state: tuple) -> Array:
+        _, at, mu, fresh, count = state
+        done = fresh & (mu == 0) & ((at.size < small) | (at.merit < floor))
+        stuck = ~at.definite & (at.merit < floor)
+        return (count < MAX_DAMPED_STEPS) & ~done & ~stuck & (mu < _MOST_DAMPING)
+
+    def advance(state: tuple) -> tuple:
+        x, at, mu, fresh, count = state
+        trial = jax.tree.map(lambda a, s: jnp.where(fresh, a - s, a), x, at.step)
+        mu_new = jnp.where(fresh, lowered(mu), mu)
+        new = evaluate(trial, mu_new)
+        downhill = work(new.residual, at.step) >= -work(at.residual, at.step)
+        taken = ~fresh | (jnp.isfinite(new.merit) & (downhill | (new.merit < at.merit) | (new.merit < floor)))
+        x, at = jax.tree.map(lambda a, b: jnp.where(taken, a, b), (trial, new), (x, at))
+        mu = jnp.where(taken, jnp.where(new.definite, mu_new, raised(mu_new)), raised(mu))
+        return x, at, mu, taken & new.definite, count + 1
+
+    first = jax.eval_shape(evaluate, start, floor)
+    at = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), first)
+    at = at._replace(merit=jnp.full_like(floor, jnp.inf), definite=jnp.array(True))
+    state = (start, at, jnp.full_like(floor, _LEAST_DAMPING), jnp.array(False), jnp.zeros((), jnp.int32))
+    x, at, _, _, count = lax.while_loop(proceed, advance, state)
+    return x, at, count

@@ -74,7 +74,10 @@ def _along(eq: Equilibrium, X: Array) -> tuple[Array, Array, Array, Array]:
     rod = eq.scene.rod
     angle = jnp.linspace(0.0, 2 * np.pi, _ANGLES + 1).astype(X.dtype)
     wall = jax.vmap(lambda x: jnp.stack(rod.section.outline(angle, x, rod.length), axis=-1))(X)
-    paths = [jnp.stack((path.y, path.z), axis=-1) for path in eq.scene.sections(X).paths]
+    sections = eq.scene.sections(X)
+    paths = [jnp.stack((path.y, path.z), axis=-1) for path in sections.paths]
+    # beyond its ends there is no thread to draw
+    paths = [p if r is None else jnp.where(r[:, None] > 0, p, jnp.nan) for p, r in zip(paths, sections.reach, strict=True)]
     threads = jnp.stack(paths, axis=1) if paths else jnp.zeros((X.size, 0, 2), X.dtype)
     return eq.pose(X), eq.strain(X), threads, wall
 

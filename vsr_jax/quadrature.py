@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ._types import Scalar
+from .component import Vector
 
 
 class Grid(NamedTuple):
@@ -35,11 +36,67 @@ def piece_edges(length: Scalar, breakpoints: tuple[Scalar, ...]) -> Float[Array,
 
 
 def make_grid(edges: Float[Array, " edges"], steps: int, stages: int) -> Grid:
-    """Grid of at least `steps` steps, shared evenly by the pieces between `edges`, with `stages` nodes a step."""
-    pieces = edges.size - 1
-    share = -(-steps // pieces)
-    width = jnp.repeat(jnp.diff(edges) / share, share, total_repeat_length=pieces * share)
-    start = jnp.repeat(edges[:-1], share, total_repeat_length=pieces * share)
-    start = start + width * np.tile(np.arange(share), pieces).astype(width.dtype)
+    """Grid of `steps` steps with `stages` nodes each.
+
+    Every piece between `edges` has at least one step, an empty piece too, so that a derivative sees it open; the other
+    steps are shared by the lengths of the pieces.
+    """
+    if edges.size == 2:
+        piece, count, place = 0, steps, np.arange(steps)
+    else:
+        piece, count, place = _share(edges, max(steps, edges.size - 1))
+    width = jnp.broadcast_to(jnp.diff(edges)[piece] / count, place.shape)
+    start = edges[:-1][piece] + place.astype(width.dtype) * width
     nodes, weights = (x.astype(width.dtype) for x in gauss_legendre(stages))
     return Grid(start, width, start + nodes[:, None] * width, jnp.asarray(weights[:, None] * width))
+
+
+def _share(edges: Float[Array, " edges"], steps: int) -> tuple[Array, Array, Array]:
+    """For each step its piece, the number of steps of that piece and its place among them; largest remainders get more."""
+    lengths = jnp.diff(edges)
+    exact = (steps - lengths.size) * lengths / jnp.sum(lengths)
+    whole = jnp.floor(exact)
+    order = jnp.argsort(jnp.argsort(whole - exact))
+    spare = steps - lengths.size - jnp.sum(whole).astype(int)
+    count = 1 + whole.astype(int) + (order < spare)
+    last = jnp.cumsum(count)
+    piece = jnp.searchsorted(last, jnp.arange(steps), side="right")
+    return piece, count[piece], jnp.arange(steps) - (last - count)[piece]
+
+
+def interpolation(stages: int) -> np.ndarray:
+    r"""Coefficients $b_{pl}$ of the polynomial $\sum_p \sigma^p \sum_l b_{pl} f_l$ through values $f_l$ at the Gauss nodes on [0, 1]."""
+    return np.linalg.inv(np.vander(gauss_legendre(stages)[0], increasing=True))
+
+
+def beyond(density: Vector, grid: Grid) -> Vector:
+    r"""Integral from each node to the end of the arm, $\int_X^L q \, ds$: exact for q of degree `stages - 1` in each step.
+
+    **Arguments:** `density`: component arrays $q$ at the nodes, shape (stages, steps).
+    """
+    stages = grid.X.shape[0]
+    nodes, weights = gauss_legendre(stages)
+    powers = np.arange(1, stages + 1)
+    rest = weights - (nodes[:, None] ** powers / powers) @ interpolation(stages)  # of the integral over a step of length 1
+
+    def integrate(q: Array) -> Array:
+        later = jnp.cumsum(jnp.sum(grid.weight * q, axis=0)[::-1])[::-1]
+        whole = jnp.append(later[1:], jnp.zeros_like(later[:1]))
+        return jnp.stack([whole + grid.h * sum(float(rest[i, j]) * q[j] for j in range(stages)) for i in range(stages)])
+
+    return tuple(integrate(q) for q in density)
+
+
+def locate(grid: Grid, X: Array) -> tuple[Array, Array]:
+    """Step in which each abscissa lies and the fraction of the step before it."""
+    step = jnp.clip(jnp.searchsorted(grid.start, X, side="right") - 1, 0, grid.start.size - 1)
+    h = grid.h[step]
+    return step, jnp.where(h > 0, (X - grid.start[step]) / jnp.where(h > 0, h, 1.0), 0.0)
+
+
+def within(density: Array, grid: Grid, step: Array, sigma: Array | float) -> Array:
+    r"""Integral from the start of a step to the fraction $\sigma$ of it of the polynomial through the values at its nodes."""
+    stages = grid.X.shape[0]
+    weights, q = interpolation(stages), density[:, step]
+    parts = [sigma ** (p + 1) / (p + 1) * sum(float(weights[p, i]) * q[i] for i in range(stages)) for p in range(stages)]
+    return grid.h[step] * sum(parts[1:], parts[0])

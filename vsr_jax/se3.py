@@ -54,23 +54,32 @@ def _stumpff_jvp(n: int, primals: tuple[Array], tangents: tuple[Array]) -> tuple
     return _stumpff(x, n), -0.5 * (_stumpff(x, n + 1) - n * _stumpff(x, n + 2)) * dx
 
 
-def exp_components(omega: Vector) -> tuple[Matrix, Vector]:
-    """`exp` on a tuple of six component arrays: the rotation as rows of components and the translation."""
-    k, u = omega[:3], omega[3:]
-    a, b, c3 = exp_coefficients(c.dot(k, k))
+def rotation_components(k: Vector) -> Matrix:
+    r"""Rotation $\exp \tilde k$ of a tuple of three component arrays, as rows of components."""
+    a, b, _ = exp_coefficients(c.dot(k, k))
+    return _rotation(k, a, b)
+
+
+def _rotation(k: Vector, a: Array, b: Array) -> Matrix:
     kx, ky, kz = k
     xx, yy, zz = b * kx * kx, b * ky * ky, b * kz * kz
     xy, xz, yz = b * kx * ky, b * kx * kz, b * ky * kz
     ax, ay, az = a * kx, a * ky, a * kz
-    rotation = (
+    return (
         (1.0 - yy - zz, xy - az, xz + ay),
         (xy + az, 1.0 - xx - zz, yz - ax),
         (xz - ay, yz + ax, 1.0 - xx - yy),
     )
+
+
+def exp_components(omega: Vector) -> tuple[Matrix, Vector]:
+    """`exp` on a tuple of six component arrays: the rotation as rows of components and the translation."""
+    k, u = omega[:3], omega[3:]
+    a, b, c3 = exp_coefficients(c.dot(k, k))
     ku = c.cross(k, u)
     kku = c.cross(k, ku)
     translation = tuple(p + b * q + c3 * s for p, q, s in zip(u, ku, kku, strict=True))
-    return rotation, translation
+    return _rotation(k, a, b), translation
 
 
 def skew(v: Float[Array, "3"]) -> Float[Array, "3 3"]:

@@ -49,9 +49,9 @@ def solve(scene: Scene, inputs: Any, *, model: Model | None = None, throw: bool 
 @eqx.filter_jit
 def _solve(scene: Scene, inputs: Float[Array, " inputs"], model: Model) -> Outcome:
     finite, admitted = jnp.all(jnp.isfinite(inputs)), scene.admits(inputs)
-    state, status, steps = model.solve(scene, jnp.where(finite & admitted, inputs, 0.0))
+    state, forces, status, steps = model.solve(scene, jnp.where(finite & admitted, inputs, 0.0))
     status = jnp.where(admitted, status, Status.INADMISSIBLE)
-    return Outcome(state, jnp.where(finite, status, Status.NOT_FINITE).astype(jnp.int32), steps)
+    return Outcome(state, forces, jnp.where(finite, status, Status.NOT_FINITE).astype(jnp.int32), steps)
 
 
 def _raise_if_failed(equilibrium: Equilibrium) -> Equilibrium:

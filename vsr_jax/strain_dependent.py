@@ -1,26 +1,32 @@
-r"""The model of eq. 19-21: the basis $B_q = \Sigma^{-1} B_\tau(\xi)$ makes $q = \tau$, and the strain is solved at each node alone."""
+r"""The model of eq. 19-21: the basis $B_q = \Sigma^{-1} B_\tau(\xi)$ makes $q = \tau$, and the strain is solved at the nodes.
 
-from typing import Any
+Without loads every node is solved alone. With them the reaction to the loads is part of each node's balance, and the nodes
+are solved together (see `coupled`).
+"""
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ._check import choice, count
-from .balance import solve_balance
+from .balance import forces_where, solve_balance
 from .component import Vector
+from .coupled import Unknown, problem_of, shares_at, state_of, with_tensions
+from .coupled_solve import solve_arm
 from .kinematics import ORDERS
-from .model import Outcome, SteppedModel, classify, rest_where_failed
+from .model import Nodes, Outcome, Status, SteppedModel, classify, rest_where_failed
+from .reaction import loading, react_at
 from .scene import Scene
 
 
 class StrainDependent(SteppedModel):
-    r"""Strain from the balance of each cross-section, $\xi = \Sigma^{-1} B_\tau(\xi) \tau + \xi^*$ (eq. 21).
+    r"""Strain from the balance of each cross-section, $\xi = \Sigma^{-1} (B_\tau(\xi) \tau + \Lambda) + \xi^*$ (eq. 21).
 
-    Exact in the strain; the only error is that of the pose steps.
+    Without loads $\Lambda = 0$ and the strain is exact; the only error is that of the pose steps. With loads the reaction is
+    that of the steps' shape, and the pose at the ends of the steps keeps nearly their order.
 
     **Arguments:**
-    - `steps`: steps along the arm, shared evenly by its smooth pieces.
+    - `steps`: steps along the arm, at least one on each of its smooth pieces, the others by their lengths.
     - `order`: order of the steps, 2, 4 (Zanna's, eq. 5) or 6, with one, two or three nodes each.
     """
 
@@ -32,17 +38,39 @@ class StrainDependent(SteppedModel):
         self.order = choice("StrainDependent.order", order, ORDERS)
 
     def solve(self, scene: Scene, inputs: Float[Array, " inputs"]) -> Outcome:
-        sections = scene.sections(self.grid(scene).X)
-        tau = scene.forces(inputs)
-        solution = solve_balance(sections, tau)
+        if scene.coupled:
+            return self._solve_together(scene, inputs)
+        sections, forces = scene.sections(self.grid(scene).X), scene.forces(inputs)
+        tau = sections.carry(forces)
+        solution = solve_balance(sections, tau, None, scene.free)
         status = classify(solution.xi, sections, tau, solution.balanced, solution.definite)
-        return Outcome(rest_where_failed(status, solution.xi, sections), status, solution.steps)
+        state = Unknown(rest_where_failed(status, solution.xi, sections), (), ())
+        return Outcome(state, forces, status, solution.steps)
 
-    def node_strain(self, scene: Scene, inputs: Float[Array, " inputs"], state: Vector) -> Vector:
-        return state
+    def _solve_together(self, scene: Scene, inputs: Float[Array, " inputs"]) -> Outcome:
+        problem, kind = problem_of(scene, inputs, self.grid(scene))
+        unknown, balanced, definite, steps = solve_arm(problem, kind)
+        tau = state_of(unknown, problem, kind).tau
+        status = classify(unknown.xi, problem.sections, tau, balanced, definite, loaded=bool(scene.loads))
+        sound = status == Status.CONVERGED
+        forces = forces_where(sound, with_tensions(problem.forces, unknown.tension, kind))
+        xi = rest_where_failed(status, unknown.xi, problem.sections)
+        return Outcome(Unknown(xi, (), forces_where(sound, unknown.turning)), forces, status, steps)
 
-    def coordinates(self, scene: Scene, inputs: Float[Array, " inputs"], state: Vector) -> Float[Array, " dofs"]:
-        return jnp.array(scene.forces(inputs), inputs.dtype)
+    def node_strain(self, scene: Scene, state: Unknown) -> Vector:
+        return state.xi
 
-    def strain(self, scene: Scene, inputs: Float[Array, " inputs"], state: Any, X: Float[Array, " stations"]) -> Vector:
-        return solve_balance(scene.sections(X), scene.forces(inputs)).xi
+    def nodes(self, scene: Scene, forces: Vector, state: Unknown) -> Nodes:
+        grid = self.grid(scene)
+        return Nodes(grid, state.xi, scene.sections(grid.X), shares_at(scene, state.turning, grid, grid.X))
+
+    def coordinates(self, scene: Scene, forces: Vector, state: Unknown) -> Float[Array, " dofs"]:
+        return jnp.array(forces, state.xi[0].dtype)
+
+    def strain(self, scene: Scene, forces: Vector, state: Unknown, X: Float[Array, " stations"]) -> Vector:
+        grid = self.grid(scene)
+        loads = loading(scene, grid)
+        reaction = None if loads is None else react_at(state.xi, grid, loads, X)
+        shares = shares_at(scene, state.turning, grid, X)
+        tau = tuple(f if share is None else f * share for f, share in zip(forces, shares, strict=True))
+        return solve_balance(scene.sections(X), tau, reaction, scene.free).xi

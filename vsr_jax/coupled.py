@@ -1,0 +1,191 @@
+r"""The balance of all cross-sections of an arm together, where loads, given thread lengths or friction tie them to each other.
+
+Unknown are the strain at the nodes, the tension T of each tendon driven by its length, and the rate $\varphi'$ at which each
+tendon with friction turns. The residual is that of eq. 21 at each node, with the reaction and the tensions that belong to the
+unknowns; for each tendon driven by its length
+
+$$\min(T, k_0 s) = 0, \quad s = (l^* + \delta)(1 + T / k) - l,$$
+
+the complementarity of tension and slack, with a stiffness $k_0$ [N/m] that only makes the two comparable; and for each tendon
+with friction the rate less that of its path.
+"""
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from . import component as c
+from .actuator import Tendon
+from .balance import (
+    chosen,
+    residual,
+    strain_norm,
+)
+from .cable import Cable, cable_of, path_length
+from .component import Vector
+from .friction import Rubbing, decay, decay_at, reaction_rate, strain_rate, turning_rate
+from .quadrature import Grid
+from .reaction import Loading, Reaction, loading, react
+from .scene import CrossSections, Scene
+
+
+class Problem(NamedTuple):
+    """What is to be balanced: `forces` of the threads at their start (ignored for cables), and what ties the sections."""
+
+    grid: Grid
+    sections: CrossSections
+    forces: Vector
+    loads: Loading | None
+    cables: tuple[Cable, ...]
+    rubbing: Rubbing | None
+
+
+class Kind(NamedTuple):
+    """Static facts of a problem: places of the free strains, of the threads that are cables, of those with friction."""
+
+    free: tuple[int, ...]
+    cables: tuple[int, ...]
+    rubbing: tuple[int, ...]
+
+
+class Unknown(NamedTuple):
+    r"""Strain at the nodes (six component arrays), tension [N] of each cable, $\varphi'$ [rad/m] at the nodes of each tendon
+    with friction."""
+
+    xi: Vector
+    tension: Vector
+    turning: Vector
+
+
+class Imbalance(NamedTuple):
+    """Residual: wrench at the nodes for the free strains, force of each cable [N], turning rate of each tendon with friction."""
+
+    wrench: Vector
+    cable: Vector
+    turning: Vector
+
+
+class State(NamedTuple):
+    """What follows from the unknowns: share of each thread's force at the nodes (None for all), its force there, the
+    reaction, the slack of each cable [m]."""
+
+    carried: tuple[Array | None, ...]
+    tau: Vector
+    along: Reaction | None
+    slack: Vector
+
+
+def problem_of(scene: Scene, inputs: Array, grid: Grid) -> tuple[Problem, Kind]:
+    """What is to be balanced on a grid."""
+    sections, forces = scene.sections(grid.X), scene.forces(inputs)
+    cables = [cable_of(scene, inputs[place], place, sections, grid) for place in scene.length_driven]
+    rubbing = None
+    if scene.rubbing:
+        _, rate = jax.jvp(scene.sections, (grid.X,), (jnp.ones_like(grid.X),))
+        rubbing = Rubbing(tuple(_signed_friction(scene, place) for place in scene.rubbing), rate)
+    problem = Problem(grid, sections, forces, loading(scene, grid), tuple(cables), rubbing)
+    return problem, Kind(scene.free, scene.length_driven, scene.rubbing)
+
+
+def with_tensions(forces: Vector, tensions: Iterable[Array], kind: Kind) -> Vector:
+    """Force of every thread at its start: as given, or minus the tension that was found."""
+    found = list(forces)
+    for place, tension in zip(kind.cables, tensions, strict=True):
+        found[place] = -tension
+    return tuple(found)
+
+
+def harmless(problem: Problem, sound: Array) -> Problem:
+    """The problem where its solution is sound, and elsewhere one that is at rest: no loads and forces, slack cables."""
+    forces = tuple(jnp.where(sound, f, 0.0) for f in problem.forces)
+    cables = tuple(cable._replace(length=jnp.where(sound, cable.length, 2 * cable.length)) for cable in problem.cables)
+    loads = problem.loads
+    if loads is not None:
+        dead, density, follower = (_where(sound, part) for part in loads[:3])
+        points = tuple(point._replace(wrench=_where(sound, point.wrench)) for point in loads.follower_points)
+        loads = loads._replace(dead=dead, dead_density=density, follower_density=follower, follower_points=points)
+    return problem._replace(forces=forces, cables=cables, loads=loads)
+
+
+def _where(sound: Array, wrench: Vector | None) -> Vector | None:
+    return None if wrench is None else tuple(jnp.where(sound, x, 0.0) for x in wrench)
+
+
+def state_of(unknown: Unknown, problem: Problem, kind: Kind) -> State:
+    """What follows from the unknowns."""
+    grid, sections, xi = problem.grid, problem.sections, unknown.xi
+    carried = list(sections.reach)
+    if problem.rubbing is not None:
+        for place, turning, mu in zip(kind.rubbing, unknown.turning, problem.rubbing.coefficients, strict=True):
+            reach = carried[place]
+            left = decay(turning if reach is None else reach * turning, mu, grid)
+            carried[place] = left if reach is None else reach * left
+    forces = with_tensions(problem.forces, unknown.tension, kind)
+    tau = tuple(f if share is None else f * share for f, share in zip(forces, carried, strict=True))
+    along = None if problem.loads is None else react(xi, grid, problem.loads)
+    slack = tuple(
+        cable.slack(tension, path_length(xi, sections, place, grid), carried[place], grid)
+        for place, cable, tension in zip(kind.cables, problem.cables, unknown.tension, strict=True)
+    )
+    return State(tuple(carried), tau, along, slack)
+
+
+def shares_at(scene: Scene, turning: Vector, grid: Grid, X: Array) -> tuple[Array | None, ...]:
+    """Share of each thread's force at abscissas X of any shape, from the turning rates at the nodes of a grid."""
+    shares = list(scene.sections(X).reach)
+    for place, rate in zip(scene.rubbing, turning, strict=True):
+        reach = scene.sections(grid.X).reach[place]
+        left = decay_at(rate if reach is None else reach * rate, _signed_friction(scene, place), grid, X)
+        here = shares[place]
+        shares[place] = left if here is None else here * left
+    return tuple(shares)
+
+
+def _signed_friction(scene: Scene, place: int) -> Array:
+    tendon = scene.actuators[place]
+    assert isinstance(tendon, Tendon)
+    assert tendon.friction is not None
+    return tendon.friction if tendon.motion == "pull" else -tendon.friction
+
+
+def imbalance_of(unknown: Unknown, at: State, problem: Problem, kind: Kind) -> Imbalance:
+    """The residual."""
+    wrench = None if at.along is None else at.along.wrench
+    r = chosen(residual(unknown.xi, problem.sections, at.tau, wrench), kind.free)
+    cables = tuple(
+        jnp.where(tension < cable.scale * slack, tension, cable.scale * slack)
+        for cable, tension, slack in zip(problem.cables, unknown.tension, at.slack, strict=True)
+    )
+    if problem.rubbing is None:
+        return Imbalance(r, cables, ())
+    rates = _turning_rates(unknown, at, problem, problem.rubbing, kind)
+    return Imbalance(r, cables, c.subtract(unknown.turning, rates))
+
+
+def _turning_rates(unknown: Unknown, at: State, problem: Problem, rubbing: Rubbing, kind: Kind) -> Vector:
+    xi, sections, loads = unknown.xi, problem.sections, problem.loads
+    slopes = [jnp.zeros_like(xi[0])] * len(at.tau)
+    for place, turning, mu in zip(kind.rubbing, unknown.turning, rubbing.coefficients, strict=True):
+        slopes[place] = -mu * turning * at.tau[place]
+    change = None
+    if at.along is not None and loads is not None:
+        change = reaction_rate(xi, at.along.wrench, at.along.body_density)
+    tau = tuple(jnp.broadcast_to(force, xi[0].shape) for force in at.tau)
+    xi_rate = strain_rate(xi, tau, tuple(slopes), change, sections, rubbing.sections_rate, kind.free)
+    return tuple(turning_rate(xi, xi_rate, sections, rubbing.sections_rate, place) for place in kind.rubbing)
+
+
+def size_of_loads(problem: Problem) -> Array:
+    """Largest of the wrenches that the loads bring, as a strain without unit."""
+    length, total = jnp.sum(problem.grid.h), jnp.zeros_like(problem.grid.h[0])
+    if problem.loads is None:
+        return total
+    densities = [c.scale(length, density) for density in problem.loads[1:3] if density is not None]
+    wrenches = [part for part in (problem.loads.dead,) if part is not None]
+    for part in (*densities, *wrenches, *(point.wrench for point in problem.loads.follower_points)):
+        moment = c.add(part[:3], tuple(length * jnp.abs(x) for x in part[3:]))
+        total = total + jnp.max(strain_norm((*moment, *part[3:]), problem.sections.stiffness))
+    return total

@@ -1,0 +1,210 @@
+r"""Solution of the coupled balance (see `coupled`): damped Newton steps with a tangent that is nearly exact, and implicit derivatives."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from . import component as c
+from .balance import (
+    chosen,
+    chosen_rows,
+    no_derivative,
+    rounding_floor,
+    solve_balance,
+    spread,
+    strain_norm,
+    tangent,
+    thread_direction,
+    thread_wrench,
+)
+from .component import Vector
+from .coupled import Imbalance, Kind, Problem, State, Unknown, harmless, imbalance_of, size_of_loads, state_of, with_tensions
+from .elimination import eliminate
+from .newton import Damped, damped_newton
+
+_MOST_TURN = 1.5
+"""Bound on how far [rad] one Newton step may turn the arm's end."""
+
+_REFINEMENTS = 30
+"""Bound on how often a tangent system is refined; it takes five to ten."""
+
+
+class Solution(NamedTuple):
+    """The unknowns, whether they balance, whether the tangent is positive definite there, and the steps taken."""
+
+    unknown: Unknown
+    balanced: Array
+    definite: Array
+    steps: Array
+
+
+def approximate_solve(
+    unknown: Unknown, at: State, right: Imbalance, problem: Problem, kind: Kind, damping: Array | float = 0.0
+) -> tuple[Unknown, Array]:
+    """Solution of the tangent system, nearly (see `elimination`; friction's own tangent is left out), and whether it is definite."""
+    sections, grid, free = problem.sections, problem.grid, kind.free
+    lower = chosen_rows(tangent(unknown.xi, sections, at.tau), free)
+    lower = tuple((*row[:-1], row[-1] + damping * s) for row, s in zip(lower, chosen(sections.stiffness, free), strict=True))
+
+    def solve(b: Vector) -> tuple[Vector, Array]:
+        return eliminate(lower, b, at.along, problem.loads, grid, free)
+
+    strain, definite = solve(right.wrench)
+    if not kind.cables:
+        return Unknown(spread(strain, free), (), right.turning), definite
+    units = [chosen(thread_wrench(thread_direction(unknown.xi, sections.paths[i])[0], sections.paths[i]), free) for i in kind.cables]
+    pulls = [_times(at.carried[i], unit) for i, unit in zip(kind.cables, units, strict=True)]
+    lengths = [_times(sections.reach[i], unit) for i, unit in zip(kind.cables, units, strict=True)]
+    answers, _ = jax.vmap(solve)(jax.tree.map(lambda *v: jnp.stack(v), *pulls))
+    shortening = jnp.stack([jnp.sum(grid.weight * c.dot(length, answers), axis=(1, 2)) for length in lengths])
+    given = jnp.stack([jnp.sum(grid.weight * c.dot(length, strain)) for length in lengths])
+    tension = _tensions(unknown, at, right, problem, kind, shortening, given)
+    strain = tuple(a - jnp.tensordot(tension, answer, 1) for a, answer in zip(strain, answers, strict=True))
+    return Unknown(spread(strain, free), tuple(tension), right.turning), definite
+
+
+def _times(share: Array | None, wrench: Vector) -> Vector:
+    return wrench if share is None else c.scale(share, wrench)
+
+
+def _tensions(unknown: Unknown, at: State, right: Imbalance, problem: Problem, kind: Kind, shortening: Array, given: Array) -> Array:
+    """Tensions of the cables from the equations left when the strain is eliminated; `shortening`: by each cable of each."""
+    rows, sides = [], []
+    for i, (place, cable, tension, slack) in enumerate(zip(kind.cables, problem.cables, unknown.tension, at.slack, strict=True)):
+        slack_now = tension < cable.scale * slack
+        unit = jnp.zeros(len(kind.cables), given.dtype).at[i].set(1.0)
+        row = shortening[i]
+        if cable.compliance is not None:
+            row = row + unit * cable.stretch(at.carried[place], problem.grid)
+        rows.append(jnp.where(slack_now, unit, cable.scale * row))
+        sides.append(jnp.where(slack_now, right.cable[i], right.cable[i] + cable.scale * given[i]))
+    return jnp.linalg.solve(jnp.stack(rows), jnp.stack(sides))
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(1,))
+def solve_arm(problem: Problem, kind: Kind) -> Solution:
+    """Equilibrium of the arm, from the balance without loads and with slack cables.
+
+    Derivatives are implicit, of any order, in forward and reverse mode: the exact tangent is solved by refining
+    `approximate_solve`.
+    """
+    return _solve(_start(problem, kind), problem, kind)
+
+
+@solve_arm.defjvp
+def _solve_arm_jvp(kind: Kind, primals: tuple[Problem], tangents: tuple[Problem]) -> tuple[Solution, Solution]:
+    solution = solve_arm(primals[0], kind)
+    # Where nothing was found there is no derivative: take it at rest without loads and forces, where it is finite.
+    sound = solution.balanced & solution.definite
+
+    def placed(change: Imbalance, problem: Problem) -> Unknown:
+        """Unknowns at the solution plus a change of those that are solved for; locked strains are those of the rod at rest."""
+        rest = problem.sections.rest
+        xi = tuple(jnp.where(sound, x, jnp.broadcast_to(r, x.shape)) for x, r in zip(solution.unknown.xi, rest, strict=True))
+        xi = c.add(xi, spread(change.wrench, kind.free))
+        xi = tuple(x if i in kind.free else jnp.broadcast_to(rest[i], x.shape) for i, x in enumerate(xi))
+        others = (tuple(jnp.where(sound, x, 0.0) for x in part) for part in solution.unknown[1:])
+        tension, turning = (c.add(x, dx) for x, dx in zip(others, change[1:], strict=True))
+        return Unknown(xi, tension, turning)
+
+    def imbalance(change: Imbalance, problem: Problem) -> Imbalance:
+        unknown, problem = placed(change, problem), harmless(problem, sound)
+        return imbalance_of(unknown, state_of(unknown, problem, kind), problem, kind)
+
+    free, others = chosen(solution.unknown.xi, kind.free), solution.unknown[1:]
+    still = jax.tree.map(jnp.zeros_like, Imbalance(free, *others))
+    _, right = jax.jvp(lambda problem: imbalance(still, problem), primals, tangents)
+    change = _tangent_solve(
+        lambda change: imbalance(change, primals[0]), placed(still, primals[0]), harmless(primals[0], sound), right, kind
+    )
+    # the rods' own rest strain moves the locked strains
+    _, locked = jax.jvp(lambda problem: placed(still, problem).xi, primals, tangents)
+    moved = spread(c.scale(-1.0, change.wrench), kind.free)
+    xi = tuple(x if i in kind.free else y for i, (x, y) in enumerate(zip(moved, locked, strict=True)))
+    d_unknown = Unknown(xi, c.scale(-1.0, change.cable), c.scale(-1.0, change.turning))
+    return solution, Solution(d_unknown, *no_derivative(*solution[1:]))
+
+
+def _tangent_solve(imbalance: Callable, unknown: Unknown, problem: Problem, right: Imbalance, kind: Kind) -> Imbalance:
+    """Solution of the exact tangent system: what `approximate_solve` leaves is solved for again, until nothing is left."""
+    still = jax.tree.map(jnp.zeros_like, right)
+    _, matvec = jax.linearize(imbalance, still)
+
+    def nearly(b: Imbalance) -> Imbalance:
+        step, _ = approximate_solve(unknown, state_of(unknown, problem, kind), b, problem, kind)
+        return Imbalance(chosen(step.xi, kind.free), step.tension, step.turning)
+
+    def refine(apply: Callable, precondition: Callable, b: Imbalance) -> Imbalance:
+        least = 4 * jnp.finfo(problem.grid.h.dtype).eps
+
+        def proceed(carry: tuple) -> Array:
+            _, correction, whole, count = carry
+            return (count < _REFINEMENTS) & (correction > least * whole)
+
+        def advance(carry: tuple) -> tuple:
+            x, _, _, count = carry
+            step = precondition(jax.tree.map(jnp.subtract, b, apply(x)))
+            x = jax.tree.map(jnp.add, x, step)
+            return x, _largest(step), _largest(x), count + 1
+
+        first = precondition(b)
+        return lax.while_loop(proceed, advance, (first, _largest(first), jnp.zeros_like(_largest(first)), 0))[0]
+
+    def transposed(b: Imbalance) -> Imbalance:
+        return jax.vjp(nearly, still)[1](b)[0]
+
+    return lax.custom_linear_solve(matvec, right, lambda apply, b: refine(apply, nearly, b), lambda apply, b: refine(apply, transposed, b))
+
+
+def _largest(tree: Imbalance) -> Array:
+    return jnp.max(jnp.stack([jnp.max(jnp.abs(leaf)) for leaf in jax.tree.leaves(tree)]))
+
+
+def _start(problem: Problem, kind: Kind) -> Unknown:
+    """Balance of each section alone, without loads, cables slack and without friction."""
+    tension = (jnp.zeros_like(problem.grid.h[0]),) * len(kind.cables)
+    tau = problem.sections.carry(with_tensions(problem.forces, tension, kind))
+    alone = solve_balance(problem.sections, tau, None, kind.free)
+    sound = alone.balanced & alone.definite
+    xi = tuple(jnp.where(sound, x, rest) for x, rest in zip(alone.xi, problem.sections.rest, strict=True))
+    return Unknown(xi, tension, (jnp.zeros_like(xi[0]),) * len(kind.rubbing))
+
+
+def _solve(start: Unknown, problem: Problem, kind: Kind) -> Solution:
+    grid, sections = problem.grid, problem.sections
+    stiffness, length = sections.stiffness, jnp.sum(grid.h)
+    axial = jnp.sum(grid.weight * stiffness[3]) / length
+
+    def strains(wrench: Vector) -> Array:
+        return strain_norm(spread(wrench, kind.free), stiffness)
+
+    def rows(imbalance: Imbalance, at: State) -> list[Array]:
+        """The other rows as strains: a force by the axial stiffness, a turning rate by what friction makes of it."""
+        turned = [length * at.tau[place] * rate / axial for place, rate in zip(kind.rubbing, imbalance.turning, strict=True)]
+        return [*(force / axial for force in imbalance.cable), *turned]
+
+    def evaluate(unknown: Unknown, damping: Array) -> Damped:
+        at = state_of(unknown, problem, kind)
+        imbalance = imbalance_of(unknown, at, problem, kind)
+        step, definite = approximate_solve(unknown, at, imbalance, problem, kind, damping)
+        moved = jnp.max(jnp.sqrt(c.dot(step.xi, c.multiply(stiffness, step.xi)) / stiffness[3]))
+        others = rows(Imbalance((), step.tension, step.turning), at)
+        # A step that coils the arm may well lower the residual, and lead nowhere.
+        turned = sum((jnp.sum(grid.weight * jnp.abs(k)) for k in step.xi[:3]), jnp.zeros_like(moved))
+        step = jax.tree.map(lambda x: x * jnp.minimum(1.0, _MOST_TURN / jnp.maximum(turned, _MOST_TURN)), step)
+        size = moved + sum((jnp.max(jnp.abs(x)) for x in others), jnp.zeros_like(moved))
+        square = jnp.sum(grid.weight * strains(imbalance.wrench) ** 2) / length
+        square = square + sum((jnp.mean(x**2) for x in rows(imbalance, at)), jnp.zeros_like(square))
+        return Damped(step, size, imbalance.wrench, jnp.sqrt(square), definite)
+
+    def work(wrench: Vector, step: Unknown) -> Array:
+        return jnp.sum(grid.weight * c.dot(wrench, chosen(step.xi, kind.free)))
+
+    floor = jnp.max(rounding_floor(stiffness, problem.forces)) * (1 + size_of_loads(problem))
+    unknown, at, steps = damped_newton(evaluate, work, start, floor)
+    return Solution(unknown, at.merit <= jnp.maximum(64 * floor, jnp.finfo(floor.dtype).eps ** 0.75), at.definite, steps)

@@ -1,0 +1,136 @@
+r"""The loaded model in a prescribed basis: $K q = B(q) \tau + \int B_q^T \Lambda \, dX$, with given thread lengths and friction.
+
+The load term is the virtual work of the loads, integrated by parts: one pass of rotations up the arm and one of wrenches
+down it (see `reaction`), no assembled Jacobian. Unknown are the coordinates and the tension of each tendon driven by its
+length; the tangent is taken by forward differentiation of the residual.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from . import component as c
+from .balance import no_derivative, residual, rounding_floor
+from .cable import path_length
+from .component import Vector
+from .coupled import Kind, Problem, harmless, size_of_loads, with_tensions
+from .friction import decay, turning_rate
+from .newton import Damped, damped_newton
+from .reaction import react
+
+
+class Unknown(NamedTuple):
+    """Coordinates, and tension [N] of each cable."""
+
+    q: Float[Array, " dofs"]
+    tension: Float[Array, " cables"]
+
+
+class Basis(NamedTuple):
+    r"""The basis at the nodes, $B_q$, shape (stages, steps, 6, n), and its change along the arm (None without friction)."""
+
+    matrix: Array
+    rate: Array | None
+
+
+class Solution(NamedTuple):
+    """The unknowns, whether they balance, whether the tangent is positive definite there, and the steps taken."""
+
+    unknown: Unknown
+    balanced: Array
+    definite: Array
+    steps: Array
+
+
+def strain(q: Array, basis: Basis, problem: Problem) -> Vector:
+    r"""Strain at the nodes, $\xi = B_q q + \xi^*$."""
+    return c.add(c.split(basis.matrix @ q), problem.sections.rest)
+
+
+def shares(xi: Vector, q: Array, basis: Basis, problem: Problem, kind: Kind) -> tuple[Array | None, ...]:
+    """Share of each thread's force at the nodes."""
+    shares = list(problem.sections.reach)
+    if problem.rubbing is None or basis.rate is None:
+        return tuple(shares)
+    rate = problem.rubbing.sections_rate
+    xi_rate = c.add(c.split(basis.rate @ q), rate.rest)
+    for place, mu in zip(kind.rubbing, problem.rubbing.coefficients, strict=True):
+        turning, reach = turning_rate(xi, xi_rate, problem.sections, rate, place), shares[place]
+        left = decay(turning if reach is None else reach * turning, mu, problem.grid)
+        shares[place] = left if reach is None else reach * left
+    return tuple(shares)
+
+
+def imbalance(unknown: Unknown, basis: Basis, problem: Problem, kind: Kind) -> Unknown:
+    """Residual: generalised force, and for each cable the lesser of tension and scaled slack [N]."""
+    grid, xi = problem.grid, strain(unknown.q, basis, problem)
+    share = shares(xi, unknown.q, basis, problem, kind)
+    forces = with_tensions(problem.forces, unknown.tension, kind)
+    tau = tuple(f if s is None else f * s for f, s in zip(forces, share, strict=True))
+    wrench = None if problem.loads is None else react(xi, grid, problem.loads).wrench
+    r = c.join(residual(xi, problem.sections, tau, wrench))
+    force = jnp.einsum("ij,ijca,ijc->a", grid.weight, basis.matrix, r)
+    rows = []
+    for place, cable, tension in zip(kind.cables, problem.cables, unknown.tension, strict=True):
+        loose = cable.scale * cable.slack(tension, path_length(xi, problem.sections, place, grid), share[place], grid)
+        rows.append(jnp.where(tension < loose, tension, loose))
+    return Unknown(force, jnp.stack(rows) if rows else unknown.tension)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(2,))
+def solve_prescribed(basis: Basis, problem: Problem, kind: Kind) -> Solution:
+    """Equilibrium in the basis, by damped Newton steps from rest. Derivatives are implicit, of any order."""
+    sections, weight = problem.sections, problem.grid.weight
+    K = jnp.einsum("ij,ijca,cij,ijcb->ab", weight, basis.matrix, jnp.stack(jnp.broadcast_arrays(*sections.stiffness)), basis.matrix)
+    factor = jnp.linalg.cholesky(K)
+    size, length = K.shape[0], jnp.sum(problem.grid.h)
+    axial = jnp.sum(weight * sections.stiffness[3]) / length
+
+    def norm(unknown: Unknown) -> Array:
+        force = jax.scipy.linalg.solve_triangular(factor, unknown.q, lower=True)
+        return jnp.sqrt(jnp.sum(force**2) / (axial * length) + jnp.sum((unknown.tension / axial) ** 2))
+
+    def evaluate(unknown: Unknown, damping: Array) -> Damped:
+        r = imbalance(unknown, basis, problem, kind)
+        J = _jacobian(unknown, basis, problem, kind)
+        J = J.at[:size, :size].add(damping * K)
+        flat = jnp.linalg.solve(J, jnp.concatenate(r))
+        step = Unknown(flat[:size], flat[size:])
+        definite = ~jnp.any(jnp.isnan(jnp.linalg.cholesky(J[:size, :size])))
+        return Damped(step, norm(Unknown(K @ step.q, step.tension)), r.q, norm(r), definite)
+
+    def work(force: Array, step: Unknown) -> Array:
+        return jnp.dot(force, step.q)
+
+    start = Unknown(jnp.zeros_like(K[0]), jnp.zeros(len(kind.cables), K.dtype))
+    floor = jnp.max(rounding_floor(sections.stiffness, problem.forces)) * (1 + size_of_loads(problem)) * size**0.5
+    unknown, at, steps = damped_newton(evaluate, work, start, floor)
+    return Solution(unknown, at.merit <= jnp.maximum(64 * floor, jnp.finfo(floor.dtype).eps ** 0.75), at.definite, steps)
+
+
+def _jacobian(unknown: Unknown, basis: Basis, problem: Problem, kind: Kind) -> Array:
+    """Derivative of the residual by the coordinates and the tensions."""
+    size = unknown.q.size
+
+    def flat(z: Array) -> Array:
+        return jnp.concatenate(imbalance(Unknown(z[:size], z[size:]), basis, problem, kind))
+
+    return jax.jacfwd(flat)(jnp.concatenate(unknown))
+
+
+@solve_prescribed.defjvp
+def _solve_prescribed_jvp(kind: Kind, primals: tuple, tangents: tuple) -> tuple[Solution, Solution]:
+    solution = solve_prescribed(*primals, kind)
+    sound = solution.balanced & solution.definite
+    unknown = Unknown(*(jnp.where(sound, x, 0.0) for x in solution.unknown))
+
+    def residual_of(basis: Basis, problem: Problem) -> Array:
+        return jnp.concatenate(imbalance(unknown, basis, harmless(problem, sound), kind))
+
+    _, change = jax.jvp(residual_of, primals, tangents)
+    J = _jacobian(unknown, primals[0], harmless(primals[1], sound), kind)
+    flat, size = -jnp.linalg.solve(J, change), unknown.q.size
+    return solution, Solution(Unknown(flat[:size], flat[size:]), *no_derivative(*solution[1:]))
