@@ -1,0 +1,266 @@
+"""vsr_jax and SoRoMoX on one loaded scene, in one process: B1's arm and helical thread under gravity and a dead tip force.
+
+    pip install ".[bench]" && python benchmarks/bench_peers.py [--json FILE] [--formulations] [--rounds N]
+
+1,024 tensions drawn uniformly from [-15, 0] N (the sign of the paper: negative pulls), float64, each shape solved on its own from a
+cold start. Tip errors are distances to vsr_jax at 96 steps of order 6, which is itself held against an independent solution at
+-5 N. "gradient" is the derivative of the tip's height, summed over the batch, by the radius, angle and phase of the helix. All
+functions are compiled first and then timed in rounds, one after another, so that a busy machine is busy for both tools alike.
+
+How SoRoMoX is used, which has no static solver, is told in `peer_soromox`. `--formulations` times the ways that were tried
+against each other.
+"""
+
+import argparse
+import importlib.metadata
+import json
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import vsr_jax as vsr
+
+BATCH = 1024
+SINGLES = 5
+TRUTH = (96, 6)
+OURS = [(8, 6), (12, 6), (16, 6), (24, 6), (16, 4), (32, 4)]
+THEIRS = [(6, 12, 1e-3), (8, 16, 1e-4), (12, 24, 1e-4), (16, 48, 1e-5)]
+SCENE: dict[str, Any] = {
+    "length": 0.75,
+    "radius": 0.01,
+    "young": 5.93e5,
+    "shear": 2.0e5,
+    "density": 120.0,
+    "helix": {"radius": 0.005, "angle": 1.529, "phase": 0.0},
+    "gravity": (0.0, 0.0, -9.81),
+    "tip_force": (0.0, 0.02, 0.02),
+}
+# Tip at -5 N by SciPy: cross-section balance by Newton, pose and moment by DOP853, base wrench by shooting with load steps.
+REFERENCE_TAU, REFERENCE_TIP = -5.0, (0.23267292337207685, 0.20950543772381253, -0.5284293230120489)
+
+
+class Job:
+    """A compiled function with its arguments, its compile time [s], and the times of its warm calls [us] by the clock and on the CPUs."""
+
+    def __init__(self, function: Callable, *args: Any, calls: int = 1):
+        start = time.perf_counter()
+        self.compiled = jax.jit(function).lower(*args).compile()
+        self.compile_s = time.perf_counter() - start
+        self.args, self.calls = args, calls
+        self.samples: list[float] = []
+        self.cpu_samples: list[float] = []
+        self.output = jax.block_until_ready(self.compiled(*args))
+
+    def run(self) -> None:
+        for _ in range(self.calls):
+            start, cpu = time.perf_counter(), time.process_time()
+            jax.block_until_ready(self.compiled(*self.args))
+            self.samples.append(1e6 * (time.perf_counter() - start))
+            self.cpu_samples.append(1e6 * (time.process_time() - cpu))
+
+    def summary(self) -> dict[str, float]:
+        """Compile time [s], median and spread (10 to 90 %) of the warm calls [us], and the median of their CPU time [us]."""
+        low, median, high = (float(x) for x in np.quantile(self.samples, [0.1, 0.5, 0.9]))
+        cpu = float(np.median(self.cpu_samples))
+        return {"compile_s": self.compile_s, "median_us": median, "low_us": low, "high_us": high, "cpu_us": cpu}
+
+
+def our_scene() -> vsr.Scene:
+    """The scene in vsr_jax."""
+    material = vsr.Material(SCENE["young"], shear=SCENE["shear"], density=SCENE["density"])
+    arm = vsr.Rod(SCENE["length"], vsr.Circular(SCENE["radius"]), material)
+    loads = [vsr.Gravity(SCENE["gravity"]), vsr.TipWrench(force=SCENE["tip_force"], frame="world")]
+    return vsr.Scene(arm, [vsr.Thread(vsr.Helix(**SCENE["helix"]))], loads=loads).astype("float64")
+
+
+def our_tips(model: vsr.StrainDependent, scene: vsr.Scene, taus: jax.Array) -> jax.Array:
+    """Tips [m] at all tensions by vsr_jax."""
+    return jax.vmap(lambda tau: vsr.solve(scene, tau, model=model).tip[:3, 3])(taus)
+
+
+def our_jobs(steps: int, order: int, taus: jax.Array) -> tuple[str, dict[str, Job]]:
+    """Name and compiled functions of one resolution of vsr_jax."""
+    scene, model = our_scene(), vsr.StrainDependent(steps, order)
+    tips = partial(our_tips, model)
+
+    def single(scene: vsr.Scene, tau: jax.Array) -> jax.Array:
+        return vsr.solve(scene, tau, model=model).tip[:3, 3]
+
+    def height(actuators: Any, scene: vsr.Scene, taus: jax.Array) -> jax.Array:
+        return jnp.sum(tips(eqx.tree_at(lambda s: s.actuators, scene, actuators), taus)[:, 2])
+
+    return f"{steps} steps of order {order}", {
+        "single": Job(single, scene, taus[0], calls=SINGLES),
+        "batch": Job(tips, scene, taus),
+        "gradient": Job(jax.grad(height), scene.actuators, scene, taus),
+    }
+
+
+def their_jobs(peer: Any, setting: tuple[int, int, float], taus: jax.Array) -> tuple[str, dict[str, Job]]:
+    """Name and compiled functions of one setting of SoRoMoX."""
+    chosen = peer.Setting(*setting)
+    arm, path = peer.build(chosen, SCENE)
+
+    def single(arm: Any, path: Any, tau: jax.Array) -> jax.Array:
+        return peer.tip(arm, peer.equilibrium(arm, path, tau, chosen.tolerance))
+
+    def tips(arm: Any, path: Any, taus: jax.Array) -> jax.Array:
+        return jax.vmap(partial(single, arm, path))(taus)
+
+    def gradient(arm: Any, path: Any, taus: jax.Array) -> Any:
+        each = jax.vmap(lambda tau: peer.height_gradient(arm, path, tau, chosen.tolerance))(taus)
+        return jax.tree.map(lambda leaf: jnp.sum(leaf, 0), each)
+
+    return str(chosen), {
+        "single": Job(single, arm, path, taus[0], calls=SINGLES),
+        "batch": Job(tips, arm, path, taus),
+        "gradient": Job(gradient, arm, path, taus),
+    }
+
+
+def errors(tips: Any, truth: np.ndarray) -> dict[str, Any]:
+    """Largest and median distance to the truth [m] among the shapes that came back, and how many did not."""
+    distance = np.linalg.norm(np.asarray(tips) - truth, axis=1)
+    found = distance[np.isfinite(distance)]
+    worst, median = (float(np.max(found)), float(np.median(found))) if len(found) else (np.inf, np.inf)
+    return {"tip_error_max": worst, "tip_error_median": median, "lost": int(len(distance) - len(found))}
+
+
+def measure(jobs: list[tuple[str, str, dict[str, Job]]], truth: np.ndarray, rounds: int) -> list[dict[str, Any]]:
+    """Rows of the table: all jobs timed in turn, round after round."""
+    for _ in range(rounds):
+        for _, _, row in jobs:
+            for job in row.values():
+                job.run()
+    rows = []
+    for tool, name, row in jobs:
+        entry: dict[str, Any] = {"tool": tool, "setting": name, **errors(row["batch"].output, truth)}
+        entry |= {kind: job.summary() for kind, job in row.items()}
+        entry["gradient_by_helix"] = [float(np.ravel(leaf)[0]) for leaf in jax.tree.leaves(row["gradient"].output)]
+        rows.append(entry)
+    return rows
+
+
+def rate(entry: dict[str, float]) -> str:
+    """Shapes a second, with their spread, as text."""
+    return "{:.0f} ({:.0f}-{:.0f})".format(*(1e6 * BATCH / entry[key] for key in ("median_us", "high_us", "low_us")))
+
+
+def print_rows(rows: list[dict[str, Any]]) -> None:
+    """Table of all settings."""
+    print("| tool | setting | tip error max [m] | median | lost | single [us] | shapes/s, 1,024 | gradients/s | compile [s] |")
+    print("|" + "---|" * 9)
+    for row in rows:
+        single = "{median_us:.0f} ({low_us:.0f}-{high_us:.0f})".format(**row["single"])
+        compiles = " / ".join(f"{row[kind]['compile_s']:.1f}" for kind in ("single", "batch", "gradient"))
+        cells = [row["tool"], row["setting"], f"{row['tip_error_max']:.1e}", f"{row['tip_error_median']:.1e}", str(row["lost"])]
+        print(f"| {' | '.join(cells)} | {single} | {rate(row['batch'])} | {rate(row['gradient'])} | {compiles} |")
+
+
+def compare(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """For each setting of the peer, our fastest that loses no shape and errs no more, in the largest and in the median error."""
+    pairs = []
+    for theirs in (row for row in rows if row["tool"] != "vsr_jax"):
+        able = [row for row in rows if row["tool"] == "vsr_jax" and not row["lost"]]
+        able = [row for row in able if all(row[key] <= theirs[key] for key in ("tip_error_max", "tip_error_median"))]
+        pair: dict[str, Any] = {"theirs": theirs["setting"], "ours": None}
+        if able:
+            ours = min(able, key=lambda row: row["batch"]["median_us"])
+            ratios = {kind: theirs[kind]["median_us"] / ours[kind]["median_us"] for kind in ("single", "batch", "gradient")}
+            pair |= {"ours": ours["setting"], **ratios, "batch_cpu": theirs["batch"]["cpu_us"] / ours["batch"]["cpu_us"]}
+        pairs.append(pair)
+    return pairs
+
+
+def print_pairs(pairs: list[dict[str, Any]]) -> None:
+    """Table of the comparison at equal or better error."""
+    print("\nvsr_jax over SoRoMoX at equal or better tip error, largest and median; times as many a second:\n")
+    print("| SoRoMoX | vsr_jax | single | 1,024 in a batch | the same, CPU time | their gradient |")
+    print("|" + "---|" * 6)
+    for pair in pairs:
+        cells = [f"{pair[kind]:.1f}" if pair["ours"] else "-" for kind in ("single", "batch", "batch_cpu", "gradient")]
+        print(f"| {pair['theirs']} | {pair['ours'] or 'none as accurate'} | {' | '.join(cells)} |")
+
+
+def formulations(peer: Any, taus: jax.Array, truth: np.ndarray, rounds: int, lanes: int = 64) -> list[dict[str, Any]]:
+    """Rows for the ways of posing the statics to SoRoMoX, at one setting, in a small batch."""
+    chosen = peer.Setting(*THEIRS[1])
+    arm, path = peer.build(chosen, SCENE)
+    rows = []
+    print(f"\nSoRoMoX's formulations, {chosen}, {lanes} in a batch:\n")
+    print("| formulation | tip error max [m] | median | us a shape | compile [s] |")
+    print("|" + "---|" * 5)
+    for name, solve in peer.FORMULATIONS.items():
+
+        def tips(arm: Any, path: Any, taus: jax.Array, solve: Callable = solve) -> jax.Array:
+            return jax.vmap(lambda tau: peer.tip(arm, solve(arm, path, tau, chosen.tolerance)))(taus)
+
+        job = Job(tips, arm, path, taus[:lanes])
+        for _ in range(rounds):
+            job.run()
+        row = {"formulation": name, "lanes": lanes, **errors(job.output, truth[:lanes]), "batch": job.summary()}
+        low, median, high = (row["batch"][key] / lanes for key in ("low_us", "median_us", "high_us"))
+        spread = f"{median:.0f} ({low:.0f}-{high:.0f})"
+        print(f"| {name} | {row['tip_error_max']:.1e} | {row['tip_error_median']:.1e} | {spread} | {job.compile_s:.1f} |", flush=True)
+        rows.append(row)
+    return rows
+
+
+def truths(taus: jax.Array) -> tuple[np.ndarray, float]:
+    """Tips [m] at all tensions by vsr_jax at high resolution, and how far its tip is from the independent one [m]."""
+    tips = jax.jit(partial(our_tips, vsr.StrainDependent(*TRUTH)))
+    found = np.asarray(tips(our_scene(), jnp.append(taus, jnp.array([[REFERENCE_TAU]]), axis=0)))
+    return found[:-1], float(np.linalg.norm(found[-1] - np.array(REFERENCE_TIP)))
+
+
+def load_peer() -> Any:
+    """The module of SoRoMoX's side; one line and status 2 if SoRoMoX is not installed."""
+    try:
+        import peer_soromox
+    except ModuleNotFoundError as error:
+        print(f"bench_peers needs {error.name}, which is not installed: pip install '.[bench]'", file=sys.stderr)
+        sys.exit(2)
+    return peer_soromox
+
+
+def main() -> None:
+    """Run the benchmark and print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path, help="write the figures here too")
+    parser.add_argument("--formulations", action="store_true", help="time the ways of posing the statics to SoRoMoX as well")
+    parser.add_argument("--rounds", type=int, default=5, help="how often each function is timed (5)")
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    peer = load_peer()
+    machine = f"{platform.machine()}, {os.cpu_count()} cores, {jax.devices()[0].device_kind}"
+    versions = {name: importlib.metadata.version(name) for name in ("jax", "soromox")} | {"vsr_jax": vsr.__version__}
+    print(f"{machine}, {', '.join(f'{name} {number}' for name, number in versions.items())}")
+    taus = jnp.asarray(np.random.default_rng(0).uniform(-15, 0, (BATCH, 1)))
+    truth, miss = truths(taus)
+    print(f"vsr_jax at {TRUTH[0]} steps of order {TRUTH[1]} is {miss:.1e} m from the independent tip at {REFERENCE_TAU} N\n", flush=True)
+    jobs = [("SoRoMoX", *their_jobs(peer, setting, taus)) for setting in THEIRS]
+    jobs += [("vsr_jax", *our_jobs(*resolution, taus)) for resolution in OURS]
+    rows = measure(jobs, truth, options.rounds)
+    print_rows(rows)
+    pairs = compare(rows)
+    print_pairs(pairs)
+    report: dict[str, Any] = {"machine": machine, "versions": versions, "truth_error": miss, "rows": rows, "pairs": pairs}
+    if options.formulations:
+        report["formulations"] = formulations(peer, taus, truth, options.rounds)
+    if options.json:
+        options.json.parent.mkdir(parents=True, exist_ok=True)
+        options.json.write_text(json.dumps(report, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

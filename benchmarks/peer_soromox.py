@@ -1,0 +1,214 @@
+"""SoRoMoX's side of bench_peers: the loaded arm B1 as the minimum of an energy put together from SoRoMoX's own functions.
+
+SoRoMoX (0.5) has no static solver. Its authors' scripts solve K q + G(q) = A(q) u by Newton's method from q = 0; on this arm, which
+is far softer than its loads, that diverges. `FORMULATIONS` keeps what else was tried. The fastest by far, and the one used:
+
+- one energy in place of the assembled forces: elastic energy, plus tension times path length, minus the work of the loads. Its
+  reverse-mode gradient costs about three runs of the kinematics, the forces a recurrence of Jacobians;
+- coordinates whitened by the Cholesky factor of SoRoMoX's stiffness matrix, in which BFGS with steps of length one is there
+  after 10 to 15 gradients, without a Hessian or load steps;
+- kinematics with all cells side by side and only the product of their steps in a scan (`cells`). SoRoMoX's own does it all
+  cell after cell and takes up to twice as long.
+
+Conventions, read in its sources and confirmed by its tip, which converges to the reference: strains angular first, rod along x, strain
+on the right of the pose, base pose as quaternion (x, y, z, w) and position, "horizontal" being the identity (its default is
+"upright"); a tendon's input is its tension >= 0 and its coordinate minus the length of its path.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix  # pyright: ignore[reportMissingImports]
+from jax import Array
+from soromox.actuation import ThreadlikeActuator, ThreadlikeRouting  # pyright: ignore[reportMissingImports]
+from soromox.actuation.threadlike import BaseThreadlikeRoutingParams  # pyright: ignore[reportMissingImports]
+from soromox.systems.components import JointSpec, LinkSpec  # pyright: ignore[reportMissingImports]
+from soromox.systems.gvs import GVS, GVSSegment, StrainBasisSpec  # pyright: ignore[reportMissingImports]
+from soromox.utils.geometry.poses import spatial_mounting_pose  # pyright: ignore[reportMissingImports]
+from soromox.utils.lie_algebra import se3  # pyright: ignore[reportMissingImports]
+
+
+class Setting(NamedTuple):
+    """Legendre order of all six strains, Gauss points along the arm, and the step, in whitened coordinates, that ends BFGS."""
+
+    order: int
+    points: int
+    tolerance: float
+
+    def __str__(self) -> str:
+        return f"order {self.order}, {self.points} points, step < {self.tolerance:g}"
+
+
+class HelixPath(BaseThreadlikeRoutingParams):
+    """The numbers of a helical path, those of `vsr.Helix`, each of shape (1,)."""
+
+    radius: Array
+    angle: Array
+    phase: Array
+    start_segment_index: tuple[int, ...] = eqx.field(static=True, default=(0,))
+    end_segment_index: tuple[int, ...] = eqx.field(static=True, default=(0,))
+
+    @property
+    def num_paths(self) -> int:
+        """How many paths this holds."""
+        return 1
+
+    def validate_structure(self) -> None:
+        """Part of SoRoMoX's protocol; nothing to check."""
+
+    def validate_values(self) -> None:
+        """Part of SoRoMoX's protocol; nothing to check."""
+
+
+class Arm(NamedTuple):
+    """A robot of SoRoMoX, the force on its tip [N], and the matrix from whitened coordinates to the robot's own."""
+
+    robot: Any
+    force: Array
+    whiten: Array
+
+
+def offset(path: HelixPath, s: Array) -> Array:
+    """Where the path crosses the section at s, in the section's frame [m]."""
+    phi = path.phase + s / (path.radius * jnp.tan(path.angle))
+    return jnp.stack([jnp.zeros_like(phi), path.radius * jnp.cos(phi), path.radius * jnp.sin(phi)])
+
+
+def offset_slope(path: HelixPath, s: Array) -> Array:
+    """Derivative of `offset` along the arm."""
+    return jax.jvp(partial(offset, path), (s,), (jnp.ones_like(s),))[1]
+
+
+def tendon(path: HelixPath) -> ThreadlikeActuator:
+    """The path driven as a tendon."""
+    return ThreadlikeActuator.tendons(ThreadlikeRouting(params=path, offset_fn=offset, derivative_fn=offset_slope))
+
+
+def build(setting: Setting, scene: dict[str, Any]) -> tuple[Arm, HelixPath]:
+    """The arm with its loads, and its thread's path, from the numbers of the scene."""
+    path = HelixPath(*(jnp.array([scene["helix"][name]]) for name in ("radius", "angle", "phase")))
+    link = LinkSpec.circular(
+        length=scene["length"],
+        radius=scene["radius"],
+        density=scene["density"],
+        reference_strain=[0.0, 0.0, 0.0, 1.0, 0.0, 0.0],
+        young_modulus=scene["young"],
+        shear_modulus=scene["shear"],
+    )
+    basis = StrainBasisSpec(type="legendre", strain_selector=[1] * 6, basis_order=setting.order)
+    segment = GVSSegment(link=link, joint=JointSpec(type="fixed"), basis=basis, num_gauss_points=setting.points)
+    mounting = spatial_mounting_pose("horizontal")
+    robot = GVS.from_segments([segment], gravity=jnp.array(scene["gravity"]), base_pose=mounting, actuators=tendon(path))
+    whiten = jnp.linalg.inv(jnp.linalg.cholesky(robot.stiffness_matrix())).T
+    return Arm(robot, jnp.array(scene["tip_force"]), whiten), path
+
+
+def own_kinematics(robot: Any, q: Array) -> Array:
+    """Poses at the ends of all cells, by SoRoMoX's own scan over them."""
+    return robot._forward_kinematics_gauss(robot._min_size_gathered(q))[0, 1:]
+
+
+def cells(robot: Any, q: Array) -> Array:
+    """The same poses with the cells side by side: SoRoMoX's bases, two-point Magnus step and exponential."""
+    q = robot._min_size_gathered(q)[0, 1]
+    width = robot.segment_lengths[0] * robot.cell_widths[0][:, None]
+    lower, upper = robot.B_Z1[0] @ q + robot.xi_ref_Z1[0], robot.B_Z2[0] @ q + robot.xi_ref_Z2[0]
+    bracket = jax.vmap(se3.small_adjoint_action)(lower, upper)
+    twists = width / 2 * (lower + upper) + jnp.sqrt(3) / 12 * width**2 * bracket
+    steps = jax.vmap(se3.exp, (0, None))(twists, robot.global_eps)
+    return jax.lax.scan(lambda pose, step: (pose @ step,) * 2, robot.g0, steps)[1]
+
+
+def tip(arm: Arm, z: Array) -> Array:
+    """Position of the tip [m] at whitened coordinates z."""
+    return cells(arm.robot, arm.whiten @ z)[-1, :3, 3]
+
+
+def energy(arm: Arm, path: HelixPath, tau: Array, z: Array, share: Any = 1.0, kinematics: Callable = cells) -> Array:
+    """Energy [J] at whitened coordinates z under the signed thread force tau [N], shape (1,), and a share of the loads."""
+    robot, q = arm.robot, arm.whiten @ z
+    positions = kinematics(robot, q)[:, :3, 3]
+    masses = robot.inner_weighted_mass_diagonals[0, :, 3]
+    work = masses @ (positions[:-1] @ robot.g[3:]) + positions[-1] @ arm.force
+    return robot.elastic_energy(q) + tau @ tendon(path).coordinates(robot, q) - share * work
+
+
+def slope(arm: Arm, path: HelixPath, tau: Array, z: Array, share: Any = 1.0) -> Array:
+    """Gradient of the energy by z: what vanishes at equilibrium."""
+    return jax.grad(energy, argnums=3)(arm, path, tau, z, share)
+
+
+def minimise(value_and_grad: Callable, z: Array, tolerance: float, max_steps: int = 60) -> Array:
+    """BFGS from z with steps of length one, halved while the energy does not fall, until a step is shorter than the tolerance."""
+
+    def step(state: tuple) -> tuple:
+        z, value, slope, inverse, length, _, count = state
+        move = -length * (inverse @ slope)  # none in the first pass, which fetches value and slope at the start
+        new_value, new_slope = value_and_grad(z + move)
+        change = new_slope - slope
+        curvature, image = move @ change, inverse @ change
+        weighted = (1 + change @ image / curvature) * move - image
+        update = (jnp.outer(weighted, move) - jnp.outer(move, image)) / curvature
+        fell = new_value <= value + 1e-4 * (move @ slope) + 1e-15
+        z, value, slope = (jnp.where(fell, new, old) for new, old in ((z + move, z), (new_value, value), (new_slope, slope)))
+        inverse = jnp.where(curvature > 0, inverse + update, inverse)
+        moved = jnp.where(fell & (count > 0), jnp.linalg.norm(move), jnp.inf)
+        return z, value, slope, inverse, jnp.where(fell, 1.0, length / 2), moved, count + 1
+
+    def unfinished(state: tuple) -> Array:
+        return (state[5] > tolerance) & (state[6] < max_steps)
+
+    start = (z, jnp.array(jnp.inf), jnp.zeros_like(z), jnp.eye(len(z)), jnp.array(1.0), jnp.array(jnp.inf), 0)
+    return jax.lax.while_loop(unfinished, step, start)[0]
+
+
+def equilibrium(arm: Arm, path: HelixPath, tau: Array, tolerance: float, kinematics: Callable = cells) -> Array:
+    """Whitened coordinates of the equilibrium, found from rest."""
+    evaluate = jax.value_and_grad(energy, argnums=3)
+    return minimise(lambda z: evaluate(arm, path, tau, z, 1.0, kinematics), jnp.zeros(len(arm.whiten)), tolerance)
+
+
+def height_gradient(arm: Arm, path: HelixPath, tau: Array, tolerance: float) -> HelixPath:
+    """Derivative of the tip's height by the path's numbers: implicit, the adjoint by conjugate gradients on Hessian products."""
+    z = equilibrium(arm, path, tau, tolerance)
+    right = jax.grad(lambda z: tip(arm, z)[2])(z)
+    _, hessian = jax.linearize(partial(slope, arm, path, tau), z)
+    adjoint, _ = jax.scipy.sparse.linalg.cg(hessian, right, tol=1e-4)
+    return jax.grad(lambda path: -slope(arm, path, tau, z) @ adjoint)(path)
+
+
+def _forces(arm: Arm, path: HelixPath, tau: Array, z: Array, share: Any) -> Array:
+    """The residual as SoRoMoX's authors write it, with the tip force by the Jacobian: K q - A(q) u + share (G(q) - J^T f)."""
+    robot, q = arm.robot, arm.whiten @ z
+    loads = robot.gravitational_force(q) - robot.jacobian_tips(q)[-1, 3:].T @ arm.force
+    return arm.whiten.T @ (robot.elastic_force(q) - robot.actuation_force(q, -tau) + share * loads)
+
+
+def _newton(residual: Callable, arm: Arm, path: HelixPath, tau: Array, tolerance: float) -> Array:
+    """Newton's method by `jax.jacfwd`: one step at each of eight shares of the loads, then four at the whole."""
+
+    def step(z: Array, share: Array) -> tuple[Array, None]:
+        at = partial(residual, arm, path, tau, share=share)
+        return z - jnp.linalg.solve(jax.jacfwd(at)(z), at(z)), None
+
+    shares = jnp.minimum(jnp.arange(1, 13) / 8, 1.0)
+    return jax.lax.scan(step, jnp.zeros(len(arm.whiten)), shares)[0]
+
+
+def _optimistix(arm: Arm, path: HelixPath, tau: Array, tolerance: float) -> Array:
+    solver = optimistix.BFGS(rtol=tolerance / 10, atol=tolerance / 10)
+    rest = jnp.zeros(len(arm.whiten))
+    return optimistix.minimise(lambda z, _: energy(arm, path, tau, z), solver, rest, max_steps=100, throw=False).value
+
+
+FORMULATIONS: dict[str, Callable] = {
+    "forces, Newton by jacfwd, 8 load steps": partial(_newton, _forces),
+    "energy, Newton by jacfwd, 8 load steps": partial(_newton, slope),
+    "energy, optimistix.BFGS": _optimistix,
+    "energy, BFGS, SoRoMoX's own kinematics": partial(equilibrium, kinematics=own_kinematics),
+    "energy, BFGS, cells side by side (used)": equilibrium,
+}
