@@ -1,11 +1,140 @@
-"""The command: the paper's table and figures for one case, and errors in one line."""
+"""The command: a scene file solved, the paper's table and figures for one case, and errors in one line."""
 
+import contextlib
+import io
 import json
+import pathlib
+import re
+from typing import NamedTuple
 
+import numpy as np
 import pytest
 
 import vsr_jax
-from vsr_jax import cli
+from vsr_jax import cli, paper
+from vsr_jax.scenefile import parse_scene
+
+HELIX = str(pathlib.Path(__file__).parents[1] / "notebooks" / "scenes" / "helix.toml")
+
+
+class Run(NamedTuple):
+    """Exit code, what was printed, and the folder of a run of the command."""
+
+    code: int
+    out: str
+    err: str
+    folder: pathlib.Path
+
+    @property
+    def arm(self):
+        return json.loads((self.folder / "arm.json").read_text())
+
+
+def solve_helix(folder, tau) -> Run:
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = cli.main(["solve", HELIX, "--inputs", tau, "--json", str(folder / "arm.json"), "--plot", str(folder / "arm.png")])
+    return Run(code, out.getvalue(), err.getvalue(), folder)
+
+
+@pytest.fixture(scope="module")
+def solved(tmp_path_factory):
+    """The paper's helix under 15 N."""
+    return solve_helix(tmp_path_factory.mktemp("solved"), "-15")
+
+
+@pytest.fixture(scope="module")
+def collapsed(tmp_path_factory):
+    """The paper's helix under more than it can carry."""
+    return solve_helix(tmp_path_factory.mktemp("collapsed"), "-5e3")
+
+
+def test_solve_saves_the_papers_helix(solved):
+    assert solved.code == cli.DONE
+    arm, expected = solved.arm, paper.reference("B1")[0]
+    assert expected.tau == -15.0
+    assert (arm["status"], arm["converged"], arm["precision"], arm["inputs"]) == ("converged", True, "float64", [-15.0])
+    assert (arm["title"], arm["model"]) == ("One helical thread (case B1 of the paper)", "StrainDependent")
+    np.testing.assert_allclose(arm["tip"], expected.tip, atol=1e-5)
+    np.testing.assert_allclose(arm["X"], np.linspace(0.0, 0.75, 41))
+    np.testing.assert_allclose(np.array(arm["position"])[::2], expected.position, atol=1e-5)
+    np.testing.assert_allclose(np.array(arm["strain"])[::2], expected.strain, atol=1e-12)
+    np.testing.assert_allclose(arm["stability"], expected.stability, rtol=1e-9)
+    assert arm["force"] == [-15.0]
+    assert 0.6 < arm["length"][0] < 0.75
+    assert (solved.folder / "arm.png").stat().st_size > 10_000
+
+
+def test_solve_prints_the_result_in_words(solved):
+    assert solved.err == ""
+    title, status, effects, tip, *axes, stability, head, thread = solved.out.splitlines()
+    assert title == "One helical thread (case B1 of the paper)"
+    assert status.startswith("  status     converged (StrainDependent, float64, ")
+    assert effects == "  effects    threads"
+    numbers = re.fullmatch(r"  tip        \((.*), (.*), (.*)\) m", tip).groups()
+    np.testing.assert_allclose([float(x) for x in numbers], paper.reference("B1")[0].tip[:3, 3], atol=1e-5)
+    assert [axis[:13] for axis in axes] == ["  its x axis ", "  its y axis ", "  its z axis "]
+    assert stability.startswith("  stability  ")
+    assert head.split() == ["actuator", "input", "force", "[N]", "length", "[m]"]
+    assert thread.split()[:5] == ["0", "Thread", "-15", "N", "-15"]
+
+
+def test_a_solve_that_fails_says_why(collapsed):
+    assert collapsed.code == cli.NOT_CONVERGED
+    assert re.search(r"status +collapsed: ", collapsed.out)
+    assert collapsed.err.endswith("arm.png is not drawn, there is no shape\n")
+    assert not (collapsed.folder / "arm.png").exists()
+    assert collapsed.arm["converged"] is False
+    assert collapsed.arm["status"].startswith("collapsed")
+    assert collapsed.arm["tip"] is collapsed.arm["strain"] is collapsed.arm["stability"] is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere.toml"], "vsr-jax: nowhere.toml: No such file or directory"),
+        ([HELIX, "--inputs", "1", "2"], r"vsr-jax: inputs: got shape \(2,\), need \(1,\), one number each for Thread"),
+        ([HELIX, "--inputs", "nan"], r"vsr-jax: inputs\[0\]: got nan, need a finite number \[N\] for a Thread"),
+        ([HELIX, "--json", "no/such/arm.json"], "vsr-jax: no/such/arm.json: there is no folder 'no/such'"),
+    ],
+    ids=["file", "number of inputs", "nan", "folder"],
+)
+def test_bad_usage_is_one_line_and_exit_code_2(arguments, message, capsys):
+    assert cli.main(["solve", *arguments]) == cli.BAD_USAGE
+    out, err = capsys.readouterr()
+    assert re.match(message, err)
+    assert err.count("\n") == 1
+    assert out == ""
+
+
+def test_a_file_without_inputs_asks_for_them(tmp_path, capsys):
+    path = tmp_path / "arm.toml"
+    path.write_text(re.sub("inputs = .*", "", pathlib.Path(HELIX).read_text()))
+    assert cli.main(["solve", str(path)]) == cli.BAD_USAGE
+    assert "arm.toml: holds no inputs, need --inputs, one number each for Thread" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", [["--model", "exact"], ["--precision", "float16"], ["--inputs", "many"]])
+def test_arguments_that_cannot_be_read_exit_with_2(option, capsys):
+    with pytest.raises(SystemExit) as exit_:
+        cli.main(["solve", HELIX, *option])
+    assert exit_.value.code == cli.BAD_USAGE
+    assert option[0] in capsys.readouterr().err
+
+
+def test_every_model_has_a_name(helix):
+    kinds = [type(cli._model(name, helix)).__name__ for name in cli.MODELS]
+    assert kinds == ["StrainDependent", "Prescribed", "Continuum"]
+    assert cli._model(None, helix) is None
+
+
+def test_help_shows_a_scene_file_that_loads(capsys):
+    with pytest.raises(SystemExit) as exit_:
+        cli.main(["solve", "--help"])
+    assert exit_.value.code == 0
+    text = capsys.readouterr().out
+    scene = text[text.index("a scene file:") + len("a scene file:") : text.index("exit codes")]
+    assert len(parse_scene(scene).scene.actuators) == 2
 
 
 def test_paper_writes_table_and_figures(tmp_path, capsys):

@@ -13,6 +13,8 @@ from vsr_jax.quadrature import make_grid
 
 LENGTH = 0.75
 
+ORDERS = [pytest.param(2, marks=pytest.mark.slow), pytest.param(4, marks=pytest.mark.slow), 6]
+
 
 def strain(X):
     """A strain that turns about changing axes and does not commute with itself."""
@@ -66,7 +68,7 @@ def test_steps_start_from_the_base():
     np.testing.assert_allclose(step_poses(parts, grid.h, base)[0], base, atol=1e-15)
 
 
-@pytest.mark.parametrize("order", [2, 4, 6])
+@pytest.mark.parametrize("order", ORDERS)
 def test_pose_between_step_ends_has_the_accuracy_of_the_steps(order, helix):
     coarse = vsr.solve(helix, jnp.array([-10.0]), model=vsr.StrainDependent(48, order))
     fine = vsr.solve(helix, jnp.array([-10.0]), model=vsr.StrainDependent(192, 6))
@@ -87,7 +89,7 @@ class TestJacobian:
         xi = jax.vmap(lambda x: self.basis.matrix(x, self.scene.rod.length) @ q)(nodes) + jnp.eye(6)[3]
         return tip_pose(tuple(x.reshape(grid.X.shape) for x in c.split(xi)), grid.h)
 
-    @pytest.mark.parametrize("order", [2, 4, 6])
+    @pytest.mark.parametrize("order", ORDERS)
     def test_is_the_derivative_of_the_pose(self, order):
         X = jnp.asarray(0.5)
         J = vsr.jacobian(self.scene, self.basis, self.q, X, steps=12, order=order)

@@ -40,7 +40,7 @@ def results(scene, inputs, model):
     return jnp.concatenate([eq.tip[:3].ravel(), eq.pose(0.31)[:3].ravel(), eq.lengths, eq.q])
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name == "continuum" else []) for name in MODELS])
 def test_derivatives_by_every_number_agree(name, scene):
     model = MODELS[name]
     numbers, rebuild = jax.flatten_util.ravel_pytree((scene, INPUTS))
@@ -115,6 +115,7 @@ def test_a_scene_may_be_built_under_jit():
     np.testing.assert_allclose(tip(0.005), vsr.solve(paper.scene("B1"), [-15.0]).tip[:3, 3], atol=1e-13)
 
 
+@pytest.mark.slow
 def test_gradients_in_single_precision(helix):
     def height(scene, tau):
         return vsr.solve(scene, tau, model=MODELS["strain-dependent"]).tip[2, 3]

@@ -1,0 +1,75 @@
+"""What a scene does not call for leaves no trace in the program."""
+
+from collections import Counter
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import vsr_jax as vsr
+
+ARM = vsr.Rod(0.3, vsr.Circular(0.01), vsr.Material(1e6, poisson=0.45, density=1000.0))
+PATH = vsr.Parallel(0.007, 0.0)
+STEPS = vsr.StrainDependent(8)
+
+
+def operations(scene):
+    """How often each primitive occurs in the solve of a scene, nested programs included."""
+    counts = Counter()
+
+    def walk(jaxpr):
+        for equation in jaxpr.eqns:
+            counts[equation.primitive.name] += 1
+            for value in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda x: hasattr(x, "jaxpr") or hasattr(x, "eqns")):
+                if hasattr(value, "jaxpr") or hasattr(value, "eqns"):
+                    walk(getattr(value, "jaxpr", value))
+
+    values = jnp.zeros(len(scene.actuators))
+    walk(jax.make_jaxpr(lambda inputs: STEPS.solve(scene, inputs).state.xi)(values).jaxpr)
+    return counts
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return operations(vsr.Scene(ARM, [vsr.Tendon(PATH)]))
+
+
+def test_tendons_alone_have_no_pass_along_the_arm(plain):
+    assert plain["while"] == 1
+    assert not any(plain[name] for name in ("scan", "sin", "cos", "exp", "cumsum", "custom_linear_solve", "lu"))
+
+
+def test_gravity_brings_the_passes_and_nothing_else():
+    loaded = operations(vsr.Scene(ARM, [vsr.Tendon(PATH)], [vsr.Gravity()]))
+    assert loaded["scan"] >= 3
+    assert not any(loaded[name] for name in ("lu", "exp"))
+
+
+def test_follower_loads_alone_carry_the_change_of_the_force():
+    dead = operations(vsr.Scene(ARM, [vsr.Tendon(PATH)], [vsr.TipWrench((0.0, 0.0, 0.1))]))
+    follower = operations(vsr.Scene(ARM, [vsr.Tendon(PATH)], [vsr.TipWrench((0.0, 0.0, 0.1), frame="body")]))
+    assert follower["mul"] > dead["mul"] + 50
+
+
+def test_only_given_lengths_solve_for_tensions(plain):
+    driven = operations(vsr.Scene(ARM, [vsr.Tendon(PATH, control="length")]))
+    assert driven["lu"] > 0
+    assert driven["scan"] == 0
+
+
+def test_only_friction_has_the_capstan(plain):
+    rubbing = operations(vsr.Scene(ARM, [vsr.Tendon(PATH, friction=0.1)]))
+    assert rubbing["exp"] > 0
+    assert rubbing["scan"] == 0
+
+
+def test_free_strains_give_the_solve_their_size(plain):
+    bending = operations(vsr.Scene(ARM, [vsr.Tendon(PATH)], free_strains=("bending_y", "bending_z")))
+    assert bending["div"] < plain["div"] - 15
+    assert bending["sqrt"] <= plain["sqrt"] - 4
+
+
+def test_an_end_costs_a_mask_only(plain):
+    ended = operations(vsr.Scene(ARM, [vsr.Tendon(PATH, end=0.2)]))
+    assert ended["while"] == plain["while"]
+    assert ended["div"] == plain["div"] + 2
