@@ -25,7 +25,7 @@ from jaxtyping import Array
 
 from .component import Matrix, Vector, add, cholesky, cholesky_solve, dot, multiply, scale, subtract
 from .newton import Evaluation, newton
-from .routing import Path
+from .routing import Path, thread_tangent
 from .scene import CrossSections
 
 ALL = tuple(range(6))
@@ -39,12 +39,6 @@ class Balance(NamedTuple):
     balanced: Array
     definite: Array
     steps: Array
-
-
-def thread_tangent(xi: Vector, path: Path) -> Vector:
-    """Tangent of a thread's path in the section's frame (eq. 11): $t_c = k \\times d + u + d'$."""
-    kx, ky, kz, ux, uy, uz = xi
-    return (ux + ky * path.z - kz * path.y, uy + path.slope_y - kx * path.z, uz + path.slope_z + kx * path.y)
 
 
 def thread_direction(xi: Vector, path: Path) -> tuple[Vector, Array]:

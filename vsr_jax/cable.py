@@ -28,6 +28,10 @@ class Cable(NamedTuple):
         """Cable left over on a path of a given length [m], negative if it is too short."""
         return self.length - path + tension * self.stretch(share, grid)
 
+    def complementarity(self, tension: Array, slack: Array) -> Array:
+        r"""$\min(T, k_0 s)$ [N], zero where one of tension and slack is zero and the other is not negative."""
+        return jnp.where(tension < self.scale * slack, tension, self.scale * slack)
+
     def stretch(self, share: Array | None, grid: Grid) -> Array:
         """Stretch per unit of the tension at the start [m/N]; `share` of it is left further on."""
         if self.compliance is None:

@@ -229,7 +229,7 @@ def _integrate(model: Continuum, scene: Scene, inputs: Array, saveat: diffrax.Sa
     def field(x: Any, line: Line, _: None) -> Line:
         return Line(strain_rate(scene, tau, line.xi, x), line.g @ hat(line.xi))
 
-    finest = 4 * float(jnp.finfo(xi.dtype).eps)
+    control = model._control(xi.dtype)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(field),
         model.solver,
@@ -238,7 +238,7 @@ def _integrate(model: Continuum, scene: Scene, inputs: Array, saveat: diffrax.Sa
         dt0=None,
         y0=Line(xi, jnp.eye(4, dtype=xi.dtype)),
         saveat=saveat,
-        stepsize_controller=diffrax.PIDController(rtol=max(model.rtol, finest), atol=max(model.atol, finest)),
+        stepsize_controller=diffrax.PIDController(rtol=control.rtol, atol=control.atol),
         max_steps=model.max_steps,
         adjoint=diffrax.ForwardMode(),
         throw=False,

@@ -19,17 +19,13 @@ from jaxtyping import Array
 
 from . import component as c
 from .actuator import Tendon
-from .balance import (
-    chosen,
-    residual,
-    strain_norm,
-)
+from .balance import chosen, residual, strain_norm
 from .cable import Cable, cable_of, path_length
 from .component import Vector
-from .friction import Rubbing, decay, decay_at, reaction_rate, strain_rate, turning_rate
+from .friction import Rubbing, decay_at, reaction_rate, rubbed, strain_rate, turning_rate
 from .quadrature import Grid
 from .reaction import Loading, Reaction, loading, react
-from .scene import CrossSections, Scene
+from .scene import CrossSections, Scene, shared
 
 
 class Problem(NamedTuple):
@@ -120,11 +116,9 @@ def state_of(unknown: Unknown, problem: Problem, kind: Kind) -> State:
     carried = list(sections.reach)
     if problem.rubbing is not None:
         for place, turning, mu in zip(kind.rubbing, unknown.turning, problem.rubbing.coefficients, strict=True):
-            reach = carried[place]
-            left = decay(turning if reach is None else reach * turning, mu, grid)
-            carried[place] = left if reach is None else reach * left
+            carried[place] = rubbed(carried[place], turning, mu, grid)
     forces = with_tensions(problem.forces, unknown.tension, kind)
-    tau = tuple(f if share is None else f * share for f, share in zip(forces, carried, strict=True))
+    tau = shared(forces, tuple(carried))
     along = None if problem.loads is None else react(xi, grid, problem.loads)
     slack = tuple(
         cable.slack(tension, path_length(xi, sections, place, grid), carried[place], grid)
@@ -156,8 +150,7 @@ def imbalance_of(unknown: Unknown, at: State, problem: Problem, kind: Kind) -> I
     wrench = None if at.along is None else at.along.wrench
     r = chosen(residual(unknown.xi, problem.sections, at.tau, wrench), kind.free)
     cables = tuple(
-        jnp.where(tension < cable.scale * slack, tension, cable.scale * slack)
-        for cable, tension, slack in zip(problem.cables, unknown.tension, at.slack, strict=True)
+        cable.complementarity(tension, slack) for cable, tension, slack in zip(problem.cables, unknown.tension, at.slack, strict=True)
     )
     if problem.rubbing is None:
         return Imbalance(r, cables, ())

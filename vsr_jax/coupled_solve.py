@@ -2,7 +2,6 @@ r"""Solution of the coupled balance (see `coupled`): damped Newton steps with a 
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,22 +24,13 @@ from .balance import (
 from .component import Vector
 from .coupled import Imbalance, Kind, Problem, State, Unknown, harmless, imbalance_of, size_of_loads, state_of, with_tensions
 from .elimination import eliminate
-from .newton import Damped, damped_newton
+from .newton import Damped, Solution, damped_newton
 
 _MOST_TURN = 1.5
 """Bound on how far [rad] one Newton step may turn the arm's end."""
 
 _REFINEMENTS = 30
 """Bound on how often a tangent system is refined; it takes five to ten."""
-
-
-class Solution(NamedTuple):
-    """The unknowns, whether they balance, whether the tangent is positive definite there, and the steps taken."""
-
-    unknown: Unknown
-    balanced: Array
-    definite: Array
-    steps: Array
 
 
 def approximate_solve(
@@ -206,5 +196,4 @@ def _solve(start: Unknown, problem: Problem, kind: Kind) -> Solution:
         return jnp.sum(grid.weight * c.dot(wrench, chosen(step.xi, kind.free)))
 
     floor = jnp.max(rounding_floor(stiffness, problem.forces)) * (1 + size_of_loads(problem))
-    unknown, at, steps = damped_newton(evaluate, work, start, floor)
-    return Solution(unknown, at.merit <= jnp.maximum(64 * floor, jnp.finfo(floor.dtype).eps ** 0.75), at.definite, steps)
+    return damped_newton(evaluate, work, start, floor)

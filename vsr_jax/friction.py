@@ -11,9 +11,10 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from . import component as c
-from .balance import actuation_wrench, chosen, chosen_rows, residual, spread, tangent, thread_tangent
+from .balance import actuation_wrench, chosen, chosen_rows, residual, spread, tangent
 from .component import Vector
 from .quadrature import Grid, beyond, locate, within
+from .routing import thread_tangent
 from .scene import CrossSections
 
 
@@ -29,6 +30,13 @@ def decay(turning: Array, coefficient: Array, grid: Grid) -> Array:
     r"""Share of the tension left at the nodes, $e^{-\mu \varphi(X)}$, from the rates $\varphi'$ there."""
     whole = jnp.sum(grid.weight * turning)
     return jnp.exp(-coefficient * (whole - beyond((turning,), grid)[0]))
+
+
+def rubbed(reach: Array | None, turning: Array, coefficient: Array, grid: Grid) -> Array:
+    """Share of a thread's force at the nodes, from where it reaches (None for everywhere) and how it turns there."""
+    if reach is None:
+        return decay(turning, coefficient, grid)
+    return reach * decay(reach * turning, coefficient, grid)
 
 
 def decay_at(turning: Array, coefficient: Array, grid: Grid, X: Array) -> Array:

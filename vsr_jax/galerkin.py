@@ -17,9 +17,10 @@ from .balance import no_derivative, residual, rounding_floor
 from .cable import path_length
 from .component import Vector
 from .coupled import Kind, Problem, harmless, size_of_loads, with_tensions
-from .friction import decay, turning_rate
-from .newton import Damped, damped_newton
+from .friction import rubbed, turning_rate
+from .newton import Damped, Solution, damped_newton
 from .reaction import react
+from .scene import shared
 
 
 class Unknown(NamedTuple):
@@ -36,15 +37,6 @@ class Basis(NamedTuple):
     rate: Array | None
 
 
-class Solution(NamedTuple):
-    """The unknowns, whether they balance, whether the tangent is positive definite there, and the steps taken."""
-
-    unknown: Unknown
-    balanced: Array
-    definite: Array
-    steps: Array
-
-
 def strain(q: Array, basis: Basis, problem: Problem) -> Vector:
     r"""Strain at the nodes, $\xi = B_q q + \xi^*$."""
     return c.add(c.split(basis.matrix @ q), problem.sections.rest)
@@ -58,9 +50,7 @@ def shares(xi: Vector, q: Array, basis: Basis, problem: Problem, kind: Kind) -> 
     rate = problem.rubbing.sections_rate
     xi_rate = c.add(c.split(basis.rate @ q), rate.rest)
     for place, mu in zip(kind.rubbing, problem.rubbing.coefficients, strict=True):
-        turning, reach = turning_rate(xi, xi_rate, problem.sections, rate, place), shares[place]
-        left = decay(turning if reach is None else reach * turning, mu, problem.grid)
-        shares[place] = left if reach is None else reach * left
+        shares[place] = rubbed(shares[place], turning_rate(xi, xi_rate, problem.sections, rate, place), mu, problem.grid)
     return tuple(shares)
 
 
@@ -69,14 +59,14 @@ def imbalance(unknown: Unknown, basis: Basis, problem: Problem, kind: Kind) -> U
     grid, xi = problem.grid, strain(unknown.q, basis, problem)
     share = shares(xi, unknown.q, basis, problem, kind)
     forces = with_tensions(problem.forces, unknown.tension, kind)
-    tau = tuple(f if s is None else f * s for f, s in zip(forces, share, strict=True))
+    tau = shared(forces, share)
     wrench = None if problem.loads is None else react(xi, grid, problem.loads).wrench
     r = c.join(residual(xi, problem.sections, tau, wrench))
     force = jnp.einsum("ij,ijca,ijc->a", grid.weight, basis.matrix, r)
     rows = []
     for place, cable, tension in zip(kind.cables, problem.cables, unknown.tension, strict=True):
-        loose = cable.scale * cable.slack(tension, path_length(xi, problem.sections, place, grid), share[place], grid)
-        rows.append(jnp.where(tension < loose, tension, loose))
+        slack = cable.slack(tension, path_length(xi, problem.sections, place, grid), share[place], grid)
+        rows.append(cable.complementarity(tension, slack))
     return Unknown(force, jnp.stack(rows) if rows else unknown.tension)
 
 
@@ -107,8 +97,7 @@ def solve_prescribed(basis: Basis, problem: Problem, kind: Kind) -> Solution:
 
     start = Unknown(jnp.zeros_like(K[0]), jnp.zeros(len(kind.cables), K.dtype))
     floor = jnp.max(rounding_floor(sections.stiffness, problem.forces)) * (1 + size_of_loads(problem)) * size**0.5
-    unknown, at, steps = damped_newton(evaluate, work, start, floor)
-    return Solution(unknown, at.merit <= jnp.maximum(64 * floor, jnp.finfo(floor.dtype).eps ** 0.75), at.definite, steps)
+    return damped_newton(evaluate, work, start, floor)
 
 
 def _jacobian(unknown: Unknown, basis: Basis, problem: Problem, kind: Kind) -> Array:

@@ -10,11 +10,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ._types import Pose
-from .balance import thread_tangent
 from .component import Vector, dot
 from .kinematics import step_components, step_poses, tip_pose
-from .quadrature import Grid, gauss_legendre, make_grid
-from .scene import CrossSections, Scene
+from .quadrature import Grid, gauss_legendre, locate, make_grid
+from .routing import thread_tangent
+from .scene import CrossSections, Scene, shared
 from .se3 import exp_components, pose
 
 
@@ -54,7 +54,7 @@ class Nodes(NamedTuple):
 
     def tau(self, forces: Vector) -> Vector:
         """Force of each thread at the nodes."""
-        return tuple(f if share is None else f * share for f, share in zip(forces, self.shares, strict=True))
+        return shared(forces, self.shares)
 
 
 class Outcome(NamedTuple):
@@ -119,7 +119,7 @@ class SteppedModel(Model):
     def poses(self, scene: Scene, forces: Vector, state: Any, X: Float[Array, " stations"]) -> Float[Array, "stations 4 4"]:
         grid = self.grid(scene)
         ends = step_poses(self.node_strain(scene, state), grid.h, scene.rod.base)
-        step = jnp.clip(jnp.searchsorted(grid.start, X, side="right") - 1, 0, grid.start.size - 1)
+        step, _ = locate(grid, X)
         h = X - grid.start[step]
         nodes = gauss_legendre(self.order // 2)[0].astype(h.dtype)
         X_nodes = grid.start[step] + nodes[:, None] * h

@@ -78,9 +78,16 @@ class Damped(NamedTuple):
     definite: Array
 
 
-def damped_newton(
-    evaluate: Callable[[Any, Array], Damped], work: Callable[[Any, Any], Array], start: Any, floor: Array
-) -> tuple[Any, Damped, Array]:
+class Solution(NamedTuple):
+    """The unknowns, whether they balance, whether the tangent is positive definite there, and the evaluations taken."""
+
+    unknown: Any
+    balanced: Array
+    definite: Array
+    steps: Array
+
+
+def damped_newton(evaluate: Callable[[Any, Array], Damped], work: Callable[[Any, Any], Array], start: Any, floor: Array) -> Solution:
     r"""Root of a residual that is the gradient of an energy, or nearly so, by Newton's method with Levenberg's damping.
 
     The tangent is $H + \mu \Sigma$: a short step in implicit time of an arm that creeps. $\mu$ rises until the tangent is
@@ -94,7 +101,7 @@ def damped_newton(
     - `work`: scalar product of a residual and a step.
     - `floor`: size of the residual that counts as rounding.
 
-    **Returns:** the point, what `evaluate` said of it, and the number of evaluations.
+    **Returns:** a `Solution`; it balances if the residual at the end is rounding or as small as a negligible step.
     """
     small = jnp.finfo(floor.dtype).eps ** 0.75
 
@@ -126,4 +133,4 @@ def damped_newton(
     at = at._replace(merit=jnp.full_like(floor, jnp.inf), definite=jnp.array(True))
     state = (start, at, jnp.full_like(floor, _LEAST_DAMPING), jnp.array(False), jnp.zeros((), jnp.int32))
     x, at, _, _, count = lax.while_loop(proceed, advance, state)
-    return x, at, count
+    return Solution(x, at.merit <= jnp.maximum(64 * floor, small), at.definite, count)

@@ -69,6 +69,14 @@ def interpolation(stages: int) -> np.ndarray:
     return np.linalg.inv(np.vander(gauss_legendre(stages)[0], increasing=True))
 
 
+def weighted(weights: np.ndarray, values: Array) -> Array:
+    """Sum of the values at the nodes of a step, each with its weight."""
+    total = float(weights[0]) * values[0]
+    for i in range(1, len(weights)):
+        total = total + float(weights[i]) * values[i]
+    return total
+
+
 def beyond(density: Vector, grid: Grid) -> Vector:
     r"""Integral from each node to the end of the arm, $\int_X^L q \, ds$: exact for q of degree `stages - 1` in each step.
 
@@ -82,7 +90,7 @@ def beyond(density: Vector, grid: Grid) -> Vector:
     def integrate(q: Array) -> Array:
         later = jnp.cumsum(jnp.sum(grid.weight * q, axis=0)[::-1])[::-1]
         whole = jnp.append(later[1:], jnp.zeros_like(later[:1]))
-        return jnp.stack([whole + grid.h * sum(float(rest[i, j]) * q[j] for j in range(stages)) for i in range(stages)])
+        return jnp.stack([whole + grid.h * weighted(row, q) for row in rest])
 
     return tuple(integrate(q) for q in density)
 
@@ -98,5 +106,5 @@ def within(density: Array, grid: Grid, step: Array, sigma: Array | float) -> Arr
     r"""Integral from the start of a step to the fraction $\sigma$ of it of the polynomial through the values at its nodes."""
     stages = grid.X.shape[0]
     weights, q = interpolation(stages), density[:, step]
-    parts = [sigma ** (p + 1) / (p + 1) * sum(float(weights[p, i]) * q[i] for i in range(stages)) for p in range(stages)]
+    parts = [sigma ** (p + 1) / (p + 1) * weighted(weights[p], q) for p in range(stages)]
     return grid.h[step] * sum(parts[1:], parts[0])

@@ -13,14 +13,13 @@ import itertools
 from typing import NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array
 
 from . import component as c
 from .component import Matrix, Vector
 from .kinematics import step_components
-from .quadrature import Grid, beyond, gauss_legendre, interpolation, locate, within
+from .quadrature import Grid, beyond, gauss_legendre, interpolation, locate, weighted, within
 from .scene import Scene
 from .se3 import rotation_components
 
@@ -96,7 +95,7 @@ def partial_rotation(k: Vector, h: Array, sigma: Array | float) -> Vector:
     """
     stages = k[0].shape[0]
     weights = interpolation(stages)
-    b = [tuple(_weighted(weights[p], x) for x in k) for p in range(stages)]
+    b = [tuple(weighted(weights[p], x) for x in k) for p in range(stages)]
     omega = c.scale(h * sigma, b[0])
     for p in range(1, stages):
         omega = c.add(omega, c.scale(h * sigma ** (p + 1) / (p + 1), b[p]))
@@ -155,14 +154,6 @@ def react_at(xi: Vector, grid: Grid, loads: Loading, X: Array) -> Vector:
         for wrench, q in zip(along.world, along.density, strict=True)
     )
     return _turn(c.transpose(R), world)
-
-
-def _weighted(weights: np.ndarray, values: Array) -> Array:
-    """Sum of the values at the nodes, each with its weight."""
-    total = float(weights[0]) * values[0]
-    for i in range(1, len(weights)):
-        total = total + float(weights[i]) * values[i]
-    return total
 
 
 def _turn(R: Matrix, wrench: Vector) -> Vector:

@@ -16,6 +16,7 @@ from jaxtyping import Array
 
 from ._check import choice, numbers
 from ._types import Scalar
+from .component import Vector
 from .profile import FunctionOfX, PolynomialProfile, SplineProfile
 
 
@@ -26,6 +27,12 @@ class Path(NamedTuple):
     z: Array
     slope_y: Array
     slope_z: Array
+
+
+def thread_tangent(xi: Vector, path: Path) -> Vector:
+    """Tangent of a thread's path in the section's frame (eq. 11): $t_c = k \\times d + u + d'$."""
+    kx, ky, kz, ux, uy, uz = xi
+    return (ux + ky * path.z - kz * path.y, uy + path.slope_y - kx * path.z, uz + path.slope_z + kx * path.y)
 
 
 class Routing(eqx.Module):

@@ -12,11 +12,11 @@ from jaxtyping import Array, Bool, Float
 from ._check import concrete, instance, is_traced, numbers
 from ._types import Scalar, cast
 from .actuator import Actuator, Tendon
-from .component import Vector, add
+from .component import Vector, add, dot
 from .load import Frame, Gravity, Load
 from .quadrature import make_grid, piece_edges
 from .rod import STRAINS, Rod
-from .routing import Path
+from .routing import Path, thread_tangent
 
 
 class CrossSections(NamedTuple):
@@ -30,7 +30,12 @@ class CrossSections(NamedTuple):
 
     def carry(self, forces: Vector) -> Vector:
         """Force of each thread here: that of its start where it reaches, none elsewhere."""
-        return tuple(f if reach is None else f * reach for f, reach in zip(forces, self.reach, strict=True))
+        return shared(forces, self.reach)
+
+
+def shared(forces: Vector, shares: tuple[Array | None, ...]) -> Vector:
+    """Forces of threads, each times its share; None stands for all of it."""
+    return tuple(f if share is None else f * share for f, share in zip(forces, shares, strict=True))
 
 
 class Scene(eqx.Module):
@@ -232,9 +237,8 @@ def _each(name: str, values: Any, kind: type, needed: str) -> tuple:
 def _rest_length(scene: Scene, place: int) -> Scalar:
     grid = make_grid(scene.edges(), 32, 3)
     sections = scene.sections(grid.X)
-    (kx, ky, kz, ux, uy, uz), path, reach = sections.rest, sections.paths[place], sections.reach[place]
-    along, y, z = ux + ky * path.z - kz * path.y, uy + path.slope_y - kx * path.z, uz + path.slope_z + kx * path.y
-    return jnp.sum(grid.weight * jnp.sqrt(along**2 + y**2 + z**2) * (1.0 if reach is None else reach))
+    t_c, reach = thread_tangent(sections.rest, sections.paths[place]), sections.reach[place]
+    return jnp.sum(grid.weight * jnp.sqrt(dot(t_c, t_c)) * (1.0 if reach is None else reach))
 
 
 @eqx.filter_jit

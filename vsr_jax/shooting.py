@@ -23,7 +23,7 @@ from .component import Vector
 from .coupled import shares_at
 from .friction import reaction_rate, strain_rate
 from .quadrature import Grid
-from .scene import CrossSections, Scene
+from .scene import CrossSections, Scene, shared
 from .se3 import hat, rotation_components
 
 _SHOTS = 12
@@ -81,8 +81,7 @@ def integrate(
     def at(t: Array) -> tuple[Array, CrossSections, Vector]:
         x = start + h * (_INSIDE + (1 - 2 * _INSIDE) * t)
         shares = shares_at(scene, guess.turning, guess.grid, x)
-        tau = tuple(f if share is None else f * share for f, share in zip(guess.forces, shares, strict=True))
-        return x, scene.sections(x), tau
+        return x, scene.sections(x), shared(guess.forces, shares)
 
     def field(t: Any, line: Line, _: None) -> Line:
         (x, sections, tau), rate = jax.jvp(at, (jnp.asarray(t, h.dtype),), (jnp.ones((), h.dtype),))
@@ -96,7 +95,6 @@ def integrate(
 
     _, sections, tau = at(jnp.zeros_like(h))
     xi = c.join(solve_balance(sections, tau, c.split(reaction), free).xi)
-    finest = 4 * float(jnp.finfo(h.dtype).eps)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(field),
         control.solver,
@@ -105,7 +103,7 @@ def integrate(
         dt0=None,
         y0=Line(xi, jnp.eye(4, dtype=h.dtype)),
         saveat=diffrax.SaveAt(t1=True),
-        stepsize_controller=diffrax.PIDController(rtol=max(control.rtol, finest), atol=max(control.atol, finest)),
+        stepsize_controller=diffrax.PIDController(rtol=control.rtol, atol=control.atol),
         max_steps=control.max_steps,
         adjoint=diffrax.ForwardMode(),
         throw=False,
@@ -131,40 +129,36 @@ def shoot(scene: Scene, guess: Guess, first: Unknown, segments: Grid, control: C
         """Strain's reaction and rotation at the end, as one array."""
         line, done, steps = integrate(scene, guess, control, start, h, rotation, reaction, jnp.ones_like(h))
         x = start + h * (1 - _INSIDE)
-        shares = shares_at(scene, guess.turning, guess.grid, x)
-        tau = tuple(f if share is None else f * share for f, share in zip(guess.forces, shares, strict=True))
+        tau = shared(guess.forces, shares_at(scene, guess.turning, guess.grid, x))
         wrench = c.join(residual(c.split(line.xi), scene.sections(x), tau))
         return jnp.concatenate([wrench, (rotation @ line.g[:3, :3]).reshape(-1)]), (line.g, done, steps)
 
     count = segments.h.size
     scale = _scale(scene, first, count)
 
+    def turned(R: Array, k: Array) -> Array:
+        return R @ c.join_matrix(rotation_components(c.split(k)))
+
     def place(z: Array) -> Unknown:
-        turned = jax.vmap(lambda R, k: R @ jnp.stack([jnp.stack(row) for row in rotation_components(c.split(k))]))
-        return Unknown(turned(first.rotation, z[:, :3]), first.reaction + z[:, 3:])
+        return Unknown(jax.vmap(turned)(first.rotation, z[:, :3]), first.reaction + z[:, 3:])
 
     def misfit(z: Array, ends: Array) -> Array:
         return _misfit(scene, place(z), ends, segments) / scale
 
     def step(carry: tuple) -> tuple:
-        z, _, count_, _, _, _ = carry
+        z, _, taken, _, _, _ = carry
 
         def one(z_row: Array, R: Array, reaction: Array, start: Array, h: Array) -> tuple[Array, tuple]:
-            turned = R @ jnp.stack([jnp.stack(row) for row in rotation_components(c.split(z_row[:3]))])
-            return over(start, h, turned, reaction + z_row[3:])
-
-        def both(*row: Array) -> tuple:
-            value, aux = one(*row)
-            return value, aux
+            end, aux = over(start, h, turned(R, z_row[:3]), reaction + z_row[3:])
+            return end, (end, aux)
 
         rows = (z, first.rotation, first.reaction, segments.start, segments.h)
-        (ends, (g, done, steps)) = jax.vmap(both)(*rows)
-        slopes = jax.vmap(jax.jacfwd(lambda *row: one(*row)[0]))(*rows)
+        slopes, (ends, (g, done, steps)) = jax.vmap(jax.jacfwd(one, has_aux=True))(*rows)
         linear = jax.jacfwd(lambda z_: misfit(z_, ends + jnp.einsum("sij,sj->si", slopes, z_ - z)))(z)
         size = z.size
         off = misfit(z, ends)
         dz = jnp.linalg.solve(linear.reshape(size, size), off.reshape(size)).reshape(z.shape)
-        return z - dz, jnp.max(jnp.abs(off)), count_ + 1, jnp.all(done), jnp.max(steps), g
+        return z - dz, jnp.max(jnp.abs(off)), taken + 1, jnp.all(done), jnp.max(steps), g
 
     def proceed(carry: tuple) -> Array:
         return (carry[2] < _SHOTS) & (carry[1] > tolerance)

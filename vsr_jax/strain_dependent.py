@@ -16,7 +16,7 @@ from .coupled_solve import solve_arm
 from .kinematics import ORDERS
 from .model import Nodes, Outcome, Status, SteppedModel, classify, rest_where_failed
 from .reaction import loading, react_at
-from .scene import Scene
+from .scene import Scene, shared
 
 
 class StrainDependent(SteppedModel):
@@ -71,6 +71,5 @@ class StrainDependent(SteppedModel):
         grid = self.grid(scene)
         loads = loading(scene, grid)
         reaction = None if loads is None else react_at(state.xi, grid, loads, X)
-        shares = shares_at(scene, state.turning, grid, X)
-        tau = tuple(f if share is None else f * share for f, share in zip(forces, shares, strict=True))
+        tau = shared(forces, shares_at(scene, state.turning, grid, X))
         return solve_balance(scene.sections(X), tau, reaction, scene.free).xi
