@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 
 import vsr_jax as vsr
 
@@ -144,7 +145,7 @@ def test_gradients_through_effects(name):
         vsr.Tendon(vsr.Parallel(0.007, 0.0), control="length", stiffness=2e3),
         vsr.Tendon(vsr.Helix(0.007, pitch=0.4), end=0.2, **options),
     ]
-    numbers, rebuild = jax.flatten_util.ravel_pytree((vsr.Scene(ARM, tendons, loads), jnp.array([-0.01, 2.0])))
+    numbers, rebuild = ravel_pytree((vsr.Scene(ARM, tendons, loads), jnp.array([-0.01, 2.0])))
 
     def height(x):
         eq = vsr.solve(*rebuild(x), model=STEPS)

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 
 import vsr_jax as vsr
 from vsr_jax import paper
@@ -43,7 +44,7 @@ def results(scene, inputs, model):
 @pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name == "continuum" else []) for name in MODELS])
 def test_derivatives_by_every_number_agree(name, scene):
     model = MODELS[name]
-    numbers, rebuild = jax.flatten_util.ravel_pytree((scene, INPUTS))
+    numbers, rebuild = ravel_pytree((scene, INPUTS))
 
     def flat(x):
         return results(*rebuild(x), model)

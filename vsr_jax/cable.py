@@ -36,7 +36,7 @@ class Cable(NamedTuple):
         """Stretch per unit of the tension at the start [m/N]; `share` of it is left further on."""
         if self.compliance is None:
             return jnp.zeros_like(self.length)
-        mean = 1.0 if share is None else jnp.sum(grid.weight * share) / jnp.sum(grid.weight * (share > 0))
+        mean = 1.0 if share is None else jnp.sum(grid.weight * share, axis=(0, 1)) / jnp.sum(grid.weight * (share > 0), axis=(0, 1))
         return self.length * self.compliance * mean
 
 
@@ -52,4 +52,4 @@ def cable_of(scene: Scene, change: Scalar, place: int, sections: CrossSections, 
 def path_length(xi: Vector, sections: CrossSections, place: int, grid: Grid) -> Array:
     r"""Length of a thread's path, $\int |t_c| dX$ [m], from the strain at the nodes."""
     length, reach = thread_direction(xi, sections.paths[place])[1], sections.reach[place]
-    return jnp.sum(grid.weight * (length if reach is None else length * reach))
+    return jnp.sum(grid.weight * (length if reach is None else length * reach), axis=(0, 1))

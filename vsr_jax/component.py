@@ -6,11 +6,27 @@ under `jax.vmap`. Written this way the kernels are plain elementwise arithmetic,
 small batched `dot_general`, `concatenate` and LAPACK calls, which it cannot fuse, never appear.
 """
 
+from typing import TypeVar
+
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
 Vector = tuple[Array, ...]
 Matrix = tuple[Vector, ...]
+
+
+Tree = TypeVar("Tree")
+
+
+def keep(tree: Tree, like: Array) -> Tree:
+    """The same values, computed once.
+
+    XLA on CPU computes sums and products anew in each of their uses, but never a division: values with many uses are divided
+    by a one that it cannot know. `like` is any array of their shape.
+    """
+    one = jnp.where(jnp.isnan(like), jnp.nan, 1.0)
+    return jax.tree.map(lambda x: x / one, tree)
 
 
 def split(array: Array) -> Vector:

@@ -39,6 +39,11 @@ class Problem(NamedTuple):
     rubbing: Rubbing | None
 
 
+    def with_share(self, share: Array) -> "Problem":
+        """The problem with a share of its loads."""
+        return self if self.loads is None else self._replace(loads=self.loads.scaled(share))
+
+
 class Kind(NamedTuple):
     """Static facts of a problem: places of the free strains, of the threads that are cables, of those with friction."""
 
@@ -173,12 +178,12 @@ def _turning_rates(unknown: Unknown, at: State, problem: Problem, rubbing: Rubbi
 
 def size_of_loads(problem: Problem) -> Array:
     """Largest of the wrenches that the loads bring, as a strain without unit."""
-    length, total = jnp.sum(problem.grid.h), jnp.zeros_like(problem.grid.h[0])
+    length, total = jnp.sum(problem.grid.h, axis=0), jnp.zeros_like(problem.grid.h[0])
     if problem.loads is None:
         return total
     densities = [c.scale(length, density) for density in problem.loads[1:3] if density is not None]
     wrenches = [part for part in (problem.loads.dead,) if part is not None]
     for part in (*densities, *wrenches, *(point.wrench for point in problem.loads.follower_points)):
         moment = c.add(part[:3], tuple(length * jnp.abs(x) for x in part[3:]))
-        total = total + jnp.max(strain_norm((*moment, *part[3:]), problem.sections.stiffness))
+        total = total + jnp.max(strain_norm((*moment, *part[3:]), problem.sections.stiffness), axis=(0, 1))
     return total

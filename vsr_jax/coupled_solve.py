@@ -2,6 +2,7 @@ r"""Solution of the coupled balance (see `coupled`): damped Newton steps with a 
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +25,7 @@ from .balance import (
 from .component import Vector
 from .coupled import Imbalance, Kind, Problem, State, Unknown, harmless, imbalance_of, size_of_loads, state_of, with_tensions
 from .elimination import eliminate
-from .newton import Damped, Solution, damped_newton
+from .newton import LOAD_SHARES, Damped, Solution, damped_newton
 
 _MOST_TURN = 1.5
 """Bound on how far [rad] one Newton step may turn the arm's end."""
@@ -42,7 +43,7 @@ def approximate_solve(
     lower = tuple((*row[:-1], row[-1] + damping * s) for row, s in zip(lower, chosen(sections.stiffness, free), strict=True))
 
     def solve(b: Vector) -> tuple[Vector, Array]:
-        return eliminate(lower, b, at.along, problem.loads, grid, free)
+        return eliminate(lower, b, unknown.xi, at.along, problem.loads, grid, free)
 
     strain, definite = solve(right.wrench)
     if not kind.cables:
@@ -52,9 +53,9 @@ def approximate_solve(
     lengths = [_times(sections.reach[i], unit) for i, unit in zip(kind.cables, units, strict=True)]
     answers, _ = jax.vmap(solve)(jax.tree.map(lambda *v: jnp.stack(v), *pulls))
     shortening = jnp.stack([jnp.sum(grid.weight * c.dot(length, answers), axis=(1, 2)) for length in lengths])
-    given = jnp.stack([jnp.sum(grid.weight * c.dot(length, strain)) for length in lengths])
+    given = jnp.stack([jnp.sum(grid.weight * c.dot(length, strain), axis=(0, 1)) for length in lengths])
     tension = _tensions(unknown, at, right, problem, kind, shortening, given)
-    strain = tuple(a - jnp.tensordot(tension, answer, 1) for a, answer in zip(strain, answers, strict=True))
+    strain = tuple(a - jnp.sum(tension[:, None, None] * answer, axis=0) for a, answer in zip(strain, answers, strict=True))
     return Unknown(spread(strain, free), tuple(tension), right.turning), definite
 
 
@@ -67,13 +68,14 @@ def _tensions(unknown: Unknown, at: State, right: Imbalance, problem: Problem, k
     rows, sides = [], []
     for i, (place, cable, tension, slack) in enumerate(zip(kind.cables, problem.cables, unknown.tension, at.slack, strict=True)):
         slack_now = tension < cable.scale * slack
-        unit = jnp.zeros(len(kind.cables), given.dtype).at[i].set(1.0)
+        unit = jnp.zeros_like(given).at[i].set(1.0)
         row = shortening[i]
         if cable.compliance is not None:
             row = row + unit * cable.stretch(at.carried[place], problem.grid)
         rows.append(jnp.where(slack_now, unit, cable.scale * row))
         sides.append(jnp.where(slack_now, right.cable[i], right.cable[i] + cable.scale * given[i]))
-    return jnp.linalg.solve(jnp.stack(rows), jnp.stack(sides))
+    matrix, side = jnp.moveaxis(jnp.stack(rows), (0, 1), (-2, -1)), jnp.moveaxis(jnp.stack(sides), 0, -1)
+    return jnp.moveaxis(jnp.linalg.solve(matrix, side[..., None])[..., 0], -1, 0)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(1,))
@@ -83,7 +85,7 @@ def solve_arm(problem: Problem, kind: Kind) -> Solution:
     Derivatives are implicit, of any order, in forward and reverse mode: the exact tangent is solved by refining
     `approximate_solve`.
     """
-    return _solve(_start(problem, kind), problem, kind)
+    return _side_by_side(kind)(_start(problem, kind), problem)
 
 
 @solve_arm.defjvp
@@ -165,10 +167,39 @@ def _start(problem: Problem, kind: Kind) -> Unknown:
     return Unknown(xi, tension, (jnp.zeros_like(xi[0]),) * len(kind.rubbing))
 
 
-def _solve(start: Unknown, problem: Problem, kind: Kind) -> Solution:
-    grid, sections = problem.grid, problem.sections
-    stiffness, length = sections.stiffness, jnp.sum(grid.h)
-    axial = jnp.sum(grid.weight * stiffness[3]) / length
+def _side_by_side(kind: Kind) -> Callable[[Unknown, Problem], Solution]:
+    """`_solve` with another rule for `jax.vmap`: the batch goes into the last axis.
+
+    Passes along the arm then read and write whole rows. With the batch in front every array that goes through a pass is
+    transposed on the way in and out, which took most of the time.
+    """
+
+    @jax.custom_batching.custom_vmap
+    def solve(start: Unknown, problem: Problem) -> Solution:
+        return _solve(start, problem, kind)
+
+    @solve.def_vmap
+    def _(size: int, batched: list, *arguments: Any) -> tuple[Solution, Any]:
+        rows = jax.tree.map(lambda x, along: jnp.moveaxis(x, 0, -1) if along else x[..., None], arguments, tuple(batched))
+        start = jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], size)), rows[0])
+        solution = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), solve(start, rows[1]))
+        return solution, jax.tree.map(lambda _: True, solution)
+
+    return solve
+
+
+def _solve(start: Unknown, whole: Problem, kind: Kind) -> Solution:
+    grid, sections = whole.grid, whole.sections
+    stiffness, length = sections.stiffness, jnp.sum(grid.h, axis=0)
+    axial = jnp.sum(grid.weight * stiffness[3], axis=(0, 1)) / length
+
+    arms = start.xi[0].shape[2:]
+
+    def inner(x: Array) -> tuple[int, ...]:
+        return tuple(range(x.ndim - len(arms)))
+
+    def largest(x: Array) -> Array:
+        return jnp.max(jnp.abs(x), axis=inner(x))
 
     def strains(wrench: Vector) -> Array:
         return strain_norm(spread(wrench, kind.free), stiffness)
@@ -178,22 +209,24 @@ def _solve(start: Unknown, problem: Problem, kind: Kind) -> Solution:
         turned = [length * at.tau[place] * rate / axial for place, rate in zip(kind.rubbing, imbalance.turning, strict=True)]
         return [*(force / axial for force in imbalance.cable), *turned]
 
-    def evaluate(unknown: Unknown, damping: Array) -> Damped:
+    def evaluate(unknown: Unknown, damping: Array, share: Array) -> Damped:
+        problem = whole.with_share(share)
         at = state_of(unknown, problem, kind)
         imbalance = imbalance_of(unknown, at, problem, kind)
         step, definite = approximate_solve(unknown, at, imbalance, problem, kind, damping)
-        moved = jnp.max(jnp.sqrt(c.dot(step.xi, c.multiply(stiffness, step.xi)) / stiffness[3]))
+        moved = largest(jnp.sqrt(c.dot(step.xi, c.multiply(stiffness, step.xi)) / stiffness[3]))
         others = rows(Imbalance((), step.tension, step.turning), at)
         # A step that coils the arm may well lower the residual, and lead nowhere.
-        turned = sum((jnp.sum(grid.weight * jnp.abs(k)) for k in step.xi[:3]), jnp.zeros_like(moved))
+        turned = sum((jnp.sum(grid.weight * jnp.abs(k), axis=(0, 1)) for k in step.xi[:3]), jnp.zeros_like(moved))
         step = jax.tree.map(lambda x: x * jnp.minimum(1.0, _MOST_TURN / jnp.maximum(turned, _MOST_TURN)), step)
-        size = moved + sum((jnp.max(jnp.abs(x)) for x in others), jnp.zeros_like(moved))
-        square = jnp.sum(grid.weight * strains(imbalance.wrench) ** 2) / length
-        square = square + sum((jnp.mean(x**2) for x in rows(imbalance, at)), jnp.zeros_like(square))
+        size = moved + sum((largest(x) for x in others), jnp.zeros_like(moved))
+        square = jnp.sum(grid.weight * strains(imbalance.wrench) ** 2, axis=(0, 1)) / length
+        square = square + sum((jnp.mean(x**2, axis=inner(x)) for x in rows(imbalance, at)), jnp.zeros_like(square))
         return Damped(step, size, imbalance.wrench, jnp.sqrt(square), definite)
 
     def work(wrench: Vector, step: Unknown) -> Array:
-        return jnp.sum(grid.weight * c.dot(wrench, chosen(step.xi, kind.free)))
+        return jnp.sum(grid.weight * c.dot(wrench, chosen(step.xi, kind.free)), axis=(0, 1))
 
-    floor = jnp.max(rounding_floor(stiffness, problem.forces)) * (1 + size_of_loads(problem))
-    return damped_newton(evaluate, work, start, floor)
+    floor = jnp.max(rounding_floor(stiffness, whole.forces), axis=(0, 1)) * (1 + size_of_loads(whole))
+    shares = 1 if whole.loads is None else LOAD_SHARES
+    return damped_newton(evaluate, work, start, jnp.broadcast_to(floor, arms), shares)

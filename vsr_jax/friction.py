@@ -28,7 +28,7 @@ class Rubbing(NamedTuple):
 
 def decay(turning: Array, coefficient: Array, grid: Grid) -> Array:
     r"""Share of the tension left at the nodes, $e^{-\mu \varphi(X)}$, from the rates $\varphi'$ there."""
-    whole = jnp.sum(grid.weight * turning)
+    whole = jnp.sum(grid.weight * turning, axis=(0, 1))
     return jnp.exp(-coefficient * (whole - beyond((turning,), grid)[0]))
 
 

@@ -18,7 +18,7 @@ from .cable import path_length
 from .component import Vector
 from .coupled import Kind, Problem, harmless, size_of_loads, with_tensions
 from .friction import rubbed, turning_rate
-from .newton import Damped, Solution, damped_newton
+from .newton import LOAD_SHARES, Damped, Solution, damped_newton
 from .reaction import react
 from .scene import shared
 
@@ -83,9 +83,10 @@ def solve_prescribed(basis: Basis, problem: Problem, kind: Kind) -> Solution:
         force = jax.scipy.linalg.solve_triangular(factor, unknown.q, lower=True)
         return jnp.sqrt(jnp.sum(force**2) / (axial * length) + jnp.sum((unknown.tension / axial) ** 2))
 
-    def evaluate(unknown: Unknown, damping: Array) -> Damped:
-        r = imbalance(unknown, basis, problem, kind)
-        J = _jacobian(unknown, basis, problem, kind)
+    def evaluate(unknown: Unknown, damping: Array, share: Array) -> Damped:
+        part = problem.with_share(share)
+        r = imbalance(unknown, basis, part, kind)
+        J = _jacobian(unknown, basis, part, kind)
         J = J.at[:size, :size].add(damping * K)
         flat = jnp.linalg.solve(J, jnp.concatenate(r))
         step = Unknown(flat[:size], flat[size:])
@@ -97,7 +98,7 @@ def solve_prescribed(basis: Basis, problem: Problem, kind: Kind) -> Solution:
 
     start = Unknown(jnp.zeros_like(K[0]), jnp.zeros(len(kind.cables), K.dtype))
     floor = jnp.max(rounding_floor(sections.stiffness, problem.forces)) * (1 + size_of_loads(problem)) * size**0.5
-    return damped_newton(evaluate, work, start, floor)
+    return damped_newton(evaluate, work, start, floor, 1 if problem.loads is None else LOAD_SHARES)
 
 
 def _jacobian(unknown: Unknown, basis: Basis, problem: Problem, kind: Kind) -> Array:

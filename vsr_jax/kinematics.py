@@ -4,6 +4,7 @@ With the strain on the right of the pose, the commutators have the opposite sign
 """
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -32,10 +33,15 @@ def step_components(stages: tuple[Vector, ...], h: Array) -> Vector:
     a1 = c.scale(h, middle)
     a2 = c.scale(math.sqrt(15) / 3 * h, c.subtract(last, first))
     a3 = c.scale(10 / 3 * h, c.add(c.subtract(first, c.scale(2.0, middle)), last))
-    c1 = bracket_components(a2, a1)
-    c2 = c.scale(1 / 60, bracket_components(a1, c.add(c.scale(2.0, a3), c1)))
+    return magnus_6(a1, a2, a3, bracket_components)
+
+
+def magnus_6(a1: Vector, a2: Vector, a3: Vector, bracket: Callable[[Vector, Vector], Vector]) -> Vector:
+    r"""Magnus expansion to sixth order for the strain $(\alpha_1 + \alpha_2 x + \alpha_3 x^2) / h$ of a step, $x \in [-1/2, 1/2]$ (see `step_twist`)."""
+    c1 = bracket(a2, a1)
+    c2 = c.scale(1 / 60, bracket(a1, c.add(c.scale(2.0, a3), c1)))
     left = c.add(c.subtract(c.scale(-20.0, a1), a3), c1)
-    inner = bracket_components(c.add(a2, c2), left)
+    inner = bracket(c.add(a2, c2), left)
     return c.add(a1, c.add(c.scale(1 / 12, a3), c.scale(1 / 240, inner)))
 
 

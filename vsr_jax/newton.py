@@ -10,6 +10,7 @@ from jaxtyping import Array
 
 MAX_STEPS = 50
 MAX_DAMPED_STEPS = 200
+LOAD_SHARES = 5
 _LEAST_FRACTION = 1e-6
 _LEAST_DAMPING, _MOST_DAMPING = 0.1, 1e8
 _RAISE, _LOWER = 10.0, 30.0
@@ -87,23 +88,29 @@ class Solution(NamedTuple):
     steps: Array
 
 
-def damped_newton(evaluate: Callable[[Any, Array], Damped], work: Callable[[Any, Any], Array], start: Any, floor: Array) -> Solution:
+def damped_newton(
+    evaluate: Callable[[Any, Array, Array], Damped], work: Callable[[Any, Any], Array], start: Any, floor: Array, shares: int = 1
+) -> Solution:
     r"""Root of a residual that is the gradient of an energy, or nearly so, by Newton's method with Levenberg's damping.
 
     The tangent is $H + \mu \Sigma$: a short step in implicit time of an arm that creeps. $\mu$ rises until the tangent is
     positive definite, and falls with every step taken. A step is taken if the residual does not push back over it more
     than it pulled, $r(x + s) \cdot s \le -r(x) \cdot s$, so that the energy falls, or if the residual has become smaller.
+    The loads come in equal shares, one more with every step taken until all are there, and such a step is always taken:
+    what matters of the way is only where it leads. All at once they often make the tangent indefinite at the start.
     The tangent may be approximate: the end is reached when an undamped step is negligible, without taking it, so that the
-    residual returned is that of the point returned.
+    residual returned is that of the point returned. Problems may stand side by side, in the last axes of all arrays: each
+    goes its own way and stands still when it is done.
 
     **Arguments:**
-    - `evaluate`: maps a point and a damping $\mu$ to `Damped`.
+    - `evaluate`: maps a point, a damping $\mu$ and the share of the loads to `Damped`.
     - `work`: scalar product of a residual and a step.
-    - `floor`: size of the residual that counts as rounding.
+    - `floor`: size of the residual that counts as rounding, of the shape of the problems side by side.
 
     **Returns:** a `Solution`; it balances if the residual at the end is rounding or as small as a negligible step.
     """
     small = jnp.finfo(floor.dtype).eps ** 0.75
+    part = 1.0 / shares
 
     def raised(mu: Array) -> Array:
         return jnp.maximum(_RAISE * mu, _LEAST_DAMPING)
@@ -111,26 +118,33 @@ def damped_newton(evaluate: Callable[[Any, Array], Damped], work: Callable[[Any,
     def lowered(mu: Array) -> Array:
         return jnp.where(mu > 1e-2 * _LEAST_DAMPING, mu / _LOWER, 0.0)
 
-    def proceed(state: tuple) -> Array:
-        _, at, mu, fresh, count = state
+    def pending(state: tuple) -> Array:
+        _, at, mu, share, fresh, count = state
         done = fresh & (mu == 0) & ((at.size < small) | (at.merit < floor))
         stuck = ~at.definite & (at.merit < floor)
-        return (count < MAX_DAMPED_STEPS) & ~done & ~stuck & (mu < _MOST_DAMPING)
+        return (count < MAX_DAMPED_STEPS) & ~((done | stuck) & (share == 1)) & (mu < _MOST_DAMPING)
 
     def advance(state: tuple) -> tuple:
-        x, at, mu, fresh, count = state
+        go = pending(state)
+        return jax.tree.map(lambda new, old: jnp.where(go, new, old), stepped(state), state)
+
+    def stepped(state: tuple) -> tuple:
+        x, at, mu, share, fresh, count = state
         trial = jax.tree.map(lambda a, s: jnp.where(fresh, a - s, a), x, at.step)
         mu_new = jnp.where(fresh, lowered(mu), mu)
-        new = evaluate(trial, mu_new)
+        share_new = jnp.where(fresh & (share < 1), jnp.where(share + 1.5 * part < 1, share + part, 1.0), share)
+        new = evaluate(trial, mu_new, share_new)
         downhill = work(new.residual, at.step) >= -work(at.residual, at.step)
-        taken = ~fresh | (jnp.isfinite(new.merit) & (downhill | (new.merit < at.merit) | (new.merit < floor)))
-        x, at = jax.tree.map(lambda a, b: jnp.where(taken, a, b), (trial, new), (x, at))
+        better = (share < 1) | downhill | (new.merit < at.merit) | (new.merit < floor)
+        taken = ~fresh | (jnp.isfinite(new.merit) & better)
+        x, at, share = jax.tree.map(lambda a, b: jnp.where(taken, a, b), (trial, new, share_new), (x, at, share))
         mu = jnp.where(taken, jnp.where(new.definite, mu_new, raised(mu_new)), raised(mu))
-        return x, at, mu, taken & new.definite, count + 1
+        return x, at, mu, share, taken & new.definite, count + 1
 
-    first = jax.eval_shape(evaluate, start, floor)
+    first = jax.eval_shape(evaluate, start, floor, floor)
     at = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), first)
-    at = at._replace(merit=jnp.full_like(floor, jnp.inf), definite=jnp.array(True))
-    state = (start, at, jnp.full_like(floor, _LEAST_DAMPING), jnp.array(False), jnp.zeros((), jnp.int32))
-    x, at, _, _, count = lax.while_loop(proceed, advance, state)
+    at = at._replace(merit=jnp.full_like(floor, jnp.inf), definite=jnp.ones(floor.shape, bool))
+    mu, share = jnp.full_like(floor, _LEAST_DAMPING if shares == 1 else 0.0), jnp.full_like(floor, part)
+    state = (start, at, mu, share, jnp.zeros(floor.shape, bool), jnp.zeros(floor.shape, jnp.int32))
+    x, at, _, _, _, count = lax.while_loop(lambda state: jnp.any(pending(state)), advance, state)
     return Solution(x, at.merit <= jnp.maximum(64 * floor, small), at.definite, count)

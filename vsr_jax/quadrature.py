@@ -80,7 +80,7 @@ def weighted(weights: np.ndarray, values: Array) -> Array:
 def beyond(density: Vector, grid: Grid) -> Vector:
     r"""Integral from each node to the end of the arm, $\int_X^L q \, ds$: exact for q of degree `stages - 1` in each step.
 
-    **Arguments:** `density`: component arrays $q$ at the nodes, shape (stages, steps).
+    **Arguments:** `density`: component arrays $q$ at the nodes, shape (stages, steps) and that of the arms side by side.
     """
     stages = grid.X.shape[0]
     nodes, weights = gauss_legendre(stages)
@@ -88,8 +88,8 @@ def beyond(density: Vector, grid: Grid) -> Vector:
     rest = weights - (nodes[:, None] ** powers / powers) @ interpolation(stages)  # of the integral over a step of length 1
 
     def integrate(q: Array) -> Array:
-        later = jnp.cumsum(jnp.sum(grid.weight * q, axis=0)[::-1])[::-1]
-        whole = jnp.append(later[1:], jnp.zeros_like(later[:1]))
+        later = jnp.cumsum(jnp.sum(grid.weight * q, axis=0)[::-1], axis=0)[::-1]
+        whole = jnp.concatenate([later[1:], jnp.zeros_like(later[:1])])
         return jnp.stack([whole + grid.h * weighted(row, q) for row in rest])
 
     return tuple(integrate(q) for q in density)

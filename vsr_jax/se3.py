@@ -57,7 +57,7 @@ def _stumpff_jvp(n: int, primals: tuple[Array], tangents: tuple[Array]) -> tuple
 def rotation_components(k: Vector) -> Matrix:
     r"""Rotation $\exp \tilde k$ of a tuple of three component arrays, as rows of components."""
     a, b, _ = exp_coefficients(c.dot(k, k))
-    return _rotation(k, a, b)
+    return _rotation(k, *c.keep((a, b), k[0]))
 
 
 def _rotation(k: Vector, a: Array, b: Array) -> Matrix:
