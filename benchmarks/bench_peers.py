@@ -17,7 +17,6 @@ import json
 import os
 import platform
 import sys
-import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -29,12 +28,13 @@ import jax.numpy as jnp
 import numpy as np
 
 import vsr_jax as vsr
+from vsr_jax.timing import Timed, take_turns
 
 BATCH = 1024
 SINGLES = 5
 TRUTH = (96, 6)
-OURS = [(6, 6), (8, 6), (12, 6), (16, 6), (24, 6), (32, 6)]
-THEIRS = [(6, 12, 1e-3), (8, 16, 1e-4), (12, 24, 1e-4), (16, 48, 1e-5)]
+OURS = [(6, 6), (8, 6), (12, 6), (16, 6), (20, 6), (24, 6)]
+THEIRS = [(6, 12, 1e-3), (8, 16, 1e-4), (12, 24, 1e-4), (16, 48, 1e-5), (20, 64, 1e-6)]
 SCENE: dict[str, Any] = {
     "length": 0.75,
     "radius": 0.01,
@@ -47,32 +47,6 @@ SCENE: dict[str, Any] = {
 }
 # Tip at -5 N by SciPy: cross-section balance by Newton, pose and moment by DOP853, base wrench by shooting with load steps.
 REFERENCE_TAU, REFERENCE_TIP = -5.0, (0.23267292337207685, 0.20950543772381253, -0.5284293230120489)
-
-
-class Job:
-    """A compiled function with its arguments, its compile time [s], and the times of its warm calls [us] by the clock and on the CPUs."""
-
-    def __init__(self, function: Callable, *args: Any, calls: int = 1):
-        start = time.perf_counter()
-        self.compiled = jax.jit(function).lower(*args).compile()
-        self.compile_s = time.perf_counter() - start
-        self.args, self.calls = args, calls
-        self.samples: list[float] = []
-        self.cpu_samples: list[float] = []
-        self.output = jax.block_until_ready(self.compiled(*args))
-
-    def run(self) -> None:
-        for _ in range(self.calls):
-            start, cpu = time.perf_counter(), time.process_time()
-            jax.block_until_ready(self.compiled(*self.args))
-            self.samples.append(1e6 * (time.perf_counter() - start))
-            self.cpu_samples.append(1e6 * (time.process_time() - cpu))
-
-    def summary(self) -> dict[str, float]:
-        """Compile time [s], median and spread (10 to 90 %) of the warm calls [us], and the median of their CPU time [us]."""
-        low, median, high = (float(x) for x in np.quantile(self.samples, [0.1, 0.5, 0.9]))
-        cpu = float(np.median(self.cpu_samples))
-        return {"compile_s": self.compile_s, "median_us": median, "low_us": low, "high_us": high, "cpu_us": cpu}
 
 
 def our_scene() -> vsr.Scene:
@@ -88,7 +62,7 @@ def our_tips(model: vsr.StrainDependent, scene: vsr.Scene, taus: jax.Array) -> j
     return jax.vmap(lambda tau: vsr.solve(scene, tau, model=model).tip[:3, 3])(taus)
 
 
-def our_jobs(steps: int, order: int, taus: jax.Array) -> tuple[str, dict[str, Job]]:
+def our_jobs(steps: int, order: int, taus: jax.Array) -> tuple[str, dict[str, Timed]]:
     """Name and compiled functions of one resolution of vsr_jax."""
     scene, model = our_scene(), vsr.StrainDependent(steps, order)
     tips = partial(our_tips, model)
@@ -100,13 +74,13 @@ def our_jobs(steps: int, order: int, taus: jax.Array) -> tuple[str, dict[str, Jo
         return jnp.sum(tips(eqx.tree_at(lambda s: s.actuators, scene, actuators), taus)[:, 2])
 
     return f"{steps} steps of order {order}", {
-        "single": Job(single, scene, taus[0], calls=SINGLES),
-        "batch": Job(tips, scene, taus),
-        "gradient": Job(jax.grad(height), scene.actuators, scene, taus),
+        "single": Timed(single, scene, taus[0], calls=SINGLES),
+        "batch": Timed(tips, scene, taus),
+        "gradient": Timed(jax.grad(height), scene.actuators, scene, taus),
     }
 
 
-def their_jobs(peer: Any, setting: tuple[int, int, float], taus: jax.Array) -> tuple[str, dict[str, Job]]:
+def their_jobs(peer: Any, setting: tuple[int, int, float], taus: jax.Array) -> tuple[str, dict[str, Timed]]:
     """Name and compiled functions of one setting of SoRoMoX."""
     chosen = peer.Setting(*setting)
     arm, path = peer.build(chosen, SCENE)
@@ -122,9 +96,9 @@ def their_jobs(peer: Any, setting: tuple[int, int, float], taus: jax.Array) -> t
         return jax.tree.map(lambda leaf: jnp.sum(leaf, 0), each)
 
     return str(chosen), {
-        "single": Job(single, arm, path, taus[0], calls=SINGLES),
-        "batch": Job(tips, arm, path, taus),
-        "gradient": Job(gradient, arm, path, taus),
+        "single": Timed(single, arm, path, taus[0], calls=SINGLES),
+        "batch": Timed(tips, arm, path, taus),
+        "gradient": Timed(gradient, arm, path, taus),
     }
 
 
@@ -136,12 +110,9 @@ def errors(tips: Any, truth: np.ndarray) -> dict[str, Any]:
     return {"tip_error_max": worst, "tip_error_median": median, "lost": int(len(distance) - len(found))}
 
 
-def measure(jobs: list[tuple[str, str, dict[str, Job]]], truth: np.ndarray, rounds: int) -> list[dict[str, Any]]:
+def measure(jobs: list[tuple[str, str, dict[str, Timed]]], truth: np.ndarray, rounds: int) -> list[dict[str, Any]]:
     """Rows of the table: all jobs timed in turn, round after round."""
-    for _ in range(rounds):
-        for _, _, row in jobs:
-            for job in row.values():
-                job.run()
+    take_turns((job for _, _, row in jobs for job in row.values()), rounds)
     rows = []
     for tool, name, row in jobs:
         entry: dict[str, Any] = {"tool": tool, "setting": name, **errors(row["batch"].output, truth)}
@@ -205,9 +176,8 @@ def formulations(peer: Any, taus: jax.Array, truth: np.ndarray, rounds: int, lan
         def tips(arm: Any, path: Any, taus: jax.Array, solve: Callable = solve) -> jax.Array:
             return jax.vmap(lambda tau: peer.tip(arm, solve(arm, path, tau, chosen.tolerance)))(taus)
 
-        job = Job(tips, arm, path, taus[:lanes])
-        for _ in range(rounds):
-            job.run()
+        job = Timed(tips, arm, path, taus[:lanes])
+        take_turns([job], rounds)
         row = {"formulation": name, "lanes": lanes, **errors(job.output, truth[:lanes]), "batch": job.summary()}
         low, median, high = (row["batch"][key] / lanes for key in ("low_us", "median_us", "high_us"))
         spread = f"{median:.0f} ({low:.0f}-{high:.0f})"

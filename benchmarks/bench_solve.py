@@ -10,10 +10,8 @@ import argparse
 import json
 import os
 import platform
-import statistics
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -25,6 +23,7 @@ import numpy as np
 
 import vsr_jax as vsr
 from vsr_jax import paper
+from vsr_jax.timing import Timed, take_turns
 
 BATCH = 1024
 REPEATS = 15
@@ -43,18 +42,9 @@ print(imported - start, built - imported, time.perf_counter() - built)
 
 def timed(function: Callable, *args: Any) -> dict[str, float]:
     """Compile time [s], and median and spread (10 to 90 %) of warm calls [us]."""
-    compiled = jax.jit(function)
-    start = time.perf_counter()
-    jax.block_until_ready(compiled(*args))
-    first = time.perf_counter() - start
-    samples = []
-    for _ in range(REPEATS):
-        start = time.perf_counter()
-        jax.block_until_ready(compiled(*args))
-        samples.append(1e6 * (time.perf_counter() - start))
-    low, high = np.quantile(samples, [0.1, 0.9])
-    median = statistics.median(samples)
-    return {"compile_s": first - 1e-6 * median, "median_us": median, "low_us": float(low), "high_us": float(high)}
+    job = Timed(function, *args)
+    take_turns([job], REPEATS)
+    return job.summary()
 
 
 def measure(name: str, scene: vsr.Scene, model: vsr.StrainDependent, dtype: str) -> dict[str, Any]:

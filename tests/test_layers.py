@@ -12,7 +12,7 @@ LAYERS = """
 _types _check component se3 quadrature profile section material routing actuator rod load scene newton balance kinematics cable
 reaction elimination friction coupled coupled_solve basis model galerkin discrete
 strain_dependent shooting continuum stability equilibrium solve
-scenefile plot paper paper_figures reproduce report cli
+scenefile plot paper paper_figures reproduce report timing effects cli
 """.split()  # noqa: SIM905
 
 

@@ -1,4 +1,4 @@
-"""The command `vsr-jax`: `vsr-jax solve` solves a scene file, `vsr-jax paper` runs section IV of the paper anew."""
+"""The command `vsr-jax`: `solve` solves a scene file, `paper` runs section IV of the paper anew, `effects` shows what each effect costs."""
 
 import argparse
 import json
@@ -77,13 +77,14 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="vsr-jax",
         description="Statics of soft manipulators: Cosserat rods bent by tendons and fluidic chambers.",
-        epilog=f"examples:\n  vsr-jax solve scene.toml --plot arm.png\n  vsr-jax paper --out results\n\n{_EXIT_CODES}",
+        epilog=f"examples:\n  vsr-jax solve scene.toml --plot arm.png\n  vsr-jax paper --out results\n  vsr-jax effects\n\n{_EXIT_CODES}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"vsr-jax {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     _add_solve(commands)
     _add_paper(commands)
+    _add_effects(commands)
     return parser
 
 
@@ -121,6 +122,29 @@ def _add_paper(commands: Any) -> None:
     command.add_argument("--out", metavar="DIR", default="paper", help="folder for the results, made if need be (default: %(default)s)")
     command.add_argument("--cases", metavar="CASE", nargs="+", help="cases among A1 A2 A3 B1 B2 C1 C2 (default: all)")
     command.set_defaults(run=_paper)
+
+
+def _add_effects(commands: Any) -> None:
+    command = commands.add_parser(
+        "effects",
+        help="what each effect of a scene costs on this machine",
+        description="Adds the effects to one arm, one after another: poses, gravity, a tip wrench, a follower load, a second section,\n"
+        "a tendon driven by its length, friction. Prints operations of the compiled program (the body of each loop counted\n"
+        "once), compile time and the times of a solve, alone and in a batch, each against the row above. Takes a minute or two.",
+        epilog=f"example:\n  vsr-jax effects --lanes 64 --json effects.json\n\n{_EXIT_CODES}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    command.add_argument("--lanes", type=_positive, default=256, help="shapes in the batch (default: %(default)s)")
+    command.add_argument("--steps", type=_positive, default=16, help="steps along the arm (default: %(default)s)")
+    command.add_argument("--json", metavar="FILE", help="save the figures")
+    command.set_defaults(run=_effects)
+
+
+def _positive(text: str) -> int:
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"got {text}, need a whole number >= 1")
+    return number
 
 
 def _solve(options: argparse.Namespace) -> int:
@@ -191,3 +215,18 @@ def _paper(options: argparse.Namespace) -> int:
     figures = "fig2" if all(row.case != "A2" for row in rows) else "fig2 and fig3"
     print(f"The whole table is in {options.out}/table.md (and .json), the figures in {options.out}: {figures} (.png, .pdf)")
     return DONE if all(row.converged for row in rows) else NOT_CONVERGED
+
+
+def _effects(options: argparse.Namespace) -> int:
+    jax.config.update("jax_enable_x64", True)
+    from . import effects
+
+    _check_folders(options.json)
+    costs = effects.measure(
+        options.lanes, model=StrainDependent(options.steps), say=lambda name: print(f"compiling: {name}", file=sys.stderr)
+    )
+    print("\n".join(effects.table(costs)))
+    if options.json:
+        rows = [cost._asdict() for cost in costs]
+        Path(options.json).write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    return DONE if all(cost.converged == 1 for cost in costs) else NOT_CONVERGED

@@ -6,6 +6,7 @@ under `jax.vmap`. Written this way the kernels are plain elementwise arithmetic,
 small batched `dot_general`, `concatenate` and LAPACK calls, which it cannot fuse, never appear.
 """
 
+import operator
 from typing import TypeVar
 
 import jax
@@ -50,14 +51,14 @@ def symmetric(lower: Matrix) -> Matrix:
     return tuple(tuple(lower[max(i, j)][min(i, j)] for j in range(size)) for i in range(size))
 
 
-def add(a: Vector, b: Vector) -> Vector:
-    """Sum $a + b$, component by component."""
-    return tuple(x + y for x, y in zip(a, b, strict=True))
+def add(a: Tree, b: Tree) -> Tree:
+    """Sum $a + b$ of two vectors or two matrices, component by component."""
+    return jax.tree.map(operator.add, a, b)
 
 
-def subtract(a: Vector, b: Vector) -> Vector:
-    """Difference $a - b$, component by component."""
-    return tuple(x - y for x, y in zip(a, b, strict=True))
+def subtract(a: Tree, b: Tree) -> Tree:
+    """Difference $a - b$ of two vectors or two matrices, component by component."""
+    return jax.tree.map(operator.sub, a, b)
 
 
 def multiply(a: Vector, b: Vector) -> Vector:
@@ -65,9 +66,9 @@ def multiply(a: Vector, b: Vector) -> Vector:
     return tuple(x * y for x, y in zip(a, b, strict=True))
 
 
-def scale(s: Array | float, a: Vector) -> Vector:
-    """Product $s a$ of a scalar and a vector."""
-    return tuple(s * x for x in a)
+def scale(s: Array | float, a: Tree) -> Tree:
+    """Product $s a$ of a scalar and a vector or a matrix."""
+    return jax.tree.map(lambda x: s * x, a)
 
 
 def dot(a: Vector, b: Vector) -> Array:
@@ -81,6 +82,12 @@ def dot(a: Vector, b: Vector) -> Array:
 def cross(a: Vector, b: Vector) -> Vector:
     """Vector product $a \\times b$ of two vectors of three components."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+def skew(v: Vector) -> Matrix:
+    r"""Matrix $\tilde v$ with $\tilde v w = v \times w$."""
+    zero = jnp.zeros_like(v[0])
+    return (zero, -v[2], v[1]), (v[2], zero, -v[0]), (-v[1], v[0], zero)
 
 
 def matvec(matrix: Matrix, vector: Vector) -> Vector:
@@ -97,6 +104,13 @@ def matmul(a: Matrix, b: Matrix) -> Matrix:
     """Product of two matrices."""
     columns = transpose(b)
     return tuple(tuple(dot(row, column) for column in columns) for row in a)
+
+
+def adjugate(matrix: Matrix) -> tuple[Matrix, Array]:
+    """Adjugate and determinant of a matrix of three rows; their quotient is the inverse."""
+    first, second, third = matrix
+    cofactors = cross(second, third), cross(third, first), cross(first, second)
+    return transpose(cofactors), dot(first, cofactors[0])
 
 
 def cholesky(lower: Matrix) -> Matrix:

@@ -38,7 +38,6 @@ class Problem(NamedTuple):
     cables: tuple[Cable, ...]
     rubbing: Rubbing | None
 
-
     def with_share(self, share: Array) -> "Problem":
         """The problem with a share of its loads."""
         return self if self.loads is None else self._replace(loads=self.loads.scaled(share))

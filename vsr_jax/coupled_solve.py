@@ -12,7 +12,6 @@ from jaxtyping import Array
 from . import component as c
 from .balance import (
     chosen,
-    chosen_rows,
     no_derivative,
     rounding_floor,
     solve_balance,
@@ -38,17 +37,17 @@ def approximate_solve(
     unknown: Unknown, at: State, right: Imbalance, problem: Problem, kind: Kind, damping: Array | float = 0.0
 ) -> tuple[Unknown, Array]:
     """Solution of the tangent system, nearly (see `elimination`; friction's own tangent is left out), and whether it is definite."""
-    sections, grid, free = problem.sections, problem.grid, kind.free
-    lower = chosen_rows(tangent(unknown.xi, sections, at.tau), free)
-    lower = tuple((*row[:-1], row[-1] + damping * s) for row, s in zip(lower, chosen(sections.stiffness, free), strict=True))
+    sections, grid = problem.sections, problem.grid
+    lower = tangent(unknown.xi, sections, at.tau)
+    lower = tuple((*row[:-1], row[-1] + damping * s) for row, s in zip(lower, sections.stiffness, strict=True))
 
     def solve(b: Vector) -> tuple[Vector, Array]:
-        return eliminate(lower, b, unknown.xi, at.along, problem.loads, grid, free)
+        return eliminate(lower, b, unknown.xi, at.along, problem.loads, grid, kind.free)
 
-    strain, definite = solve(right.wrench)
+    strain, definite = solve(spread(right.wrench, kind.free))
     if not kind.cables:
-        return Unknown(spread(strain, free), (), right.turning), definite
-    units = [chosen(thread_wrench(thread_direction(unknown.xi, sections.paths[i])[0], sections.paths[i]), free) for i in kind.cables]
+        return Unknown(strain, (), right.turning), definite
+    units = [thread_wrench(thread_direction(unknown.xi, sections.paths[i])[0], sections.paths[i]) for i in kind.cables]
     pulls = [_times(at.carried[i], unit) for i, unit in zip(kind.cables, units, strict=True)]
     lengths = [_times(sections.reach[i], unit) for i, unit in zip(kind.cables, units, strict=True)]
     answers, _ = jax.vmap(solve)(jax.tree.map(lambda *v: jnp.stack(v), *pulls))
@@ -56,7 +55,7 @@ def approximate_solve(
     given = jnp.stack([jnp.sum(grid.weight * c.dot(length, strain), axis=(0, 1)) for length in lengths])
     tension = _tensions(unknown, at, right, problem, kind, shortening, given)
     strain = tuple(a - jnp.sum(tension[:, None, None] * answer, axis=0) for a, answer in zip(strain, answers, strict=True))
-    return Unknown(spread(strain, free), tuple(tension), right.turning), definite
+    return Unknown(strain, tuple(tension), right.turning), definite
 
 
 def _times(share: Array | None, wrench: Vector) -> Vector:
@@ -126,9 +125,10 @@ def _tangent_solve(imbalance: Callable, unknown: Unknown, problem: Problem, righ
     """Solution of the exact tangent system: what `approximate_solve` leaves is solved for again, until nothing is left."""
     still = jax.tree.map(jnp.zeros_like, right)
     _, matvec = jax.linearize(imbalance, still)
+    at = state_of(unknown, problem, kind)
 
     def nearly(b: Imbalance) -> Imbalance:
-        step, _ = approximate_solve(unknown, state_of(unknown, problem, kind), b, problem, kind)
+        step, _ = approximate_solve(unknown, at, b, problem, kind)
         return Imbalance(chosen(step.xi, kind.free), step.tension, step.turning)
 
     def refine(apply: Callable, precondition: Callable, b: Imbalance) -> Imbalance:
@@ -140,12 +140,12 @@ def _tangent_solve(imbalance: Callable, unknown: Unknown, problem: Problem, righ
 
         def advance(carry: tuple) -> tuple:
             x, _, _, count = carry
-            step = precondition(jax.tree.map(jnp.subtract, b, apply(x)))
-            x = jax.tree.map(jnp.add, x, step)
+            step = precondition(c.subtract(b, apply(x)))
+            x = c.add(x, step)
             return x, _largest(step), _largest(x), count + 1
 
-        first = precondition(b)
-        return lax.while_loop(proceed, advance, (first, _largest(first), jnp.zeros_like(_largest(first)), 0))[0]
+        size = jnp.zeros_like(_largest(b))
+        return lax.while_loop(proceed, advance, (still, size + jnp.inf, size, 0))[0]
 
     def transposed(b: Imbalance) -> Imbalance:
         return jax.vjp(nearly, still)[1](b)[0]
