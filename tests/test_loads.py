@@ -37,7 +37,7 @@ def some(*quick):
     return [pytest.param(name, marks=[] if name[:2] in quick else pytest.mark.slow) for name in CASES]
 
 
-@pytest.mark.parametrize("name", some("B1", "C1"))
+@pytest.mark.parametrize("name", some("B1"))
 def test_strain_dependent_is_the_reference(name):
     eq, error = tip_error(name, vsr.StrainDependent(32))
     assert error < 1e-7
@@ -46,6 +46,7 @@ def test_strain_dependent_is_the_reference(name):
     assert np.max(np.abs(np.asarray(eq.strain(np.array(case["X"]))) - case["strain"]) / scale) < 1e-5
 
 
+@pytest.mark.slow
 def test_loaded_tips_have_the_order_of_the_steps():
     """Sixth order needs the nodes' own rotations to sixth order: with first commutators alone it was 4.5."""
     errors = [tip_error("B1 gravity and tip force", vsr.StrainDependent(steps))[1] for steps in (6, 12)]
@@ -143,12 +144,18 @@ def test_bad_scenes_are_refused(make, message, unchecked):
         make()
 
 
-def test_vmap_and_jit_over_loads():
+def test_batches_in_batches_are_the_single_solves_and_bad_lanes_harm_none():
+    lengths = jnp.array([0.5, 0.4])
     forces = jnp.array([[0.0, 0.0, 0.1], [0.0, 0.1, 0.0], [-0.2, 0.0, 0.05]])
 
-    def tip(force):
-        return vsr.solve(vsr.Scene(ARM, [], [vsr.TipWrench(force)]), [], model=vsr.StrainDependent(8)).tip
+    def tip(length, force):
+        arm = vsr.Rod(length, ARM.section, ARM.material)
+        return vsr.solve(vsr.Scene(arm, [], [vsr.TipWrench(force)]), [], model=vsr.StrainDependent(8)).tip
 
-    tips = jax.jit(jax.vmap(tip))(forces)
-    np.testing.assert_allclose(tips[2], tip(forces[2]), atol=1e-11)
-    np.testing.assert_allclose(tips[0, [0, 2], 3], tips[1, [0, 1], 3], atol=1e-11)
+    batch = jax.jit(jax.vmap(jax.vmap(tip, (None, 0)), (0, None)))
+    tips = batch(lengths, forces)
+    np.testing.assert_allclose(tips[1, 2], tip(lengths[1], forces[2]), atol=1e-11)
+    np.testing.assert_allclose(tips[0, 0, [0, 2], 3], tips[0, 1, [0, 1], 3], atol=1e-11)
+    spoiled = batch(lengths, forces.at[1].set(jnp.array([jnp.nan, 1e300, 0.0])))
+    assert np.all(np.isnan(spoiled[:, 1]))
+    np.testing.assert_array_equal(spoiled[:, [0, 2]], tips[:, [0, 2]])

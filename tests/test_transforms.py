@@ -41,7 +41,7 @@ def results(scene, inputs, model):
     return jnp.concatenate([eq.tip[:3].ravel(), eq.pose(0.31)[:3].ravel(), eq.lengths, eq.q])
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name == "continuum" else []) for name in MODELS])
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[] if name == "strain-dependent" else pytest.mark.slow) for name in MODELS])
 def test_derivatives_by_every_number_agree(name, scene):
     model = MODELS[name]
     numbers, rebuild = ravel_pytree((scene, INPUTS))

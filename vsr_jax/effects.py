@@ -125,7 +125,7 @@ def table(costs: Sequence[Cost]) -> list[str]:
 
 def _timed_cell(summary: dict[str, float], lanes: int, above: dict[str, float] | None) -> str:
     low, median, high = (summary[key] / lanes for key in ("low_us", "median_us", "high_us"))
-    return _cell(f"{median:.3g} ({low:.3g}-{high:.3g})", summary["median_us"], above and above["median_us"])
+    return _cell(f"{median:.3g} ({low:.3g}-{high:.3g})", summary["median_us"], None if above is None else above["median_us"])
 
 
 def _cell(text: str, value: float | None, above: float | None) -> str:

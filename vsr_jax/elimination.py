@@ -26,8 +26,6 @@ from .component import Matrix, Vector
 from .quadrature import Grid
 from .reaction import Loading, Reaction
 
-_IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-
 
 class Cell(NamedTuple):
     r"""What the elimination knows of one node before it comes to it, in the frame of its section.
@@ -182,7 +180,7 @@ def _turns(R: Matrix, grid: Grid) -> Matrix:
     def followed(x: Array, last: float) -> Array:
         return _unflat(jnp.concatenate([x, jnp.full_like(x[:1], last)]), grid)
 
-    return jax.tree.map(followed, relative, _IDENTITY)
+    return tuple(tuple(followed(x, float(i == j)) for j, x in enumerate(row)) for i, row in enumerate(relative))
 
 
 def _jumps(along: Reaction, loads: Loading, grid: Grid) -> Vector | None:
@@ -204,12 +202,14 @@ def _cell(end: tuple[Matrix, Vector], cell: Cell) -> tuple[tuple[Matrix, Vector]
     P, p = _seen_from_here(*end, cell)
     mean, mean_p = _carried(P, p, cell, 0.5)
     Q, q = c.matmul(cell.compliance, mean[:3]), c.matvec(cell.compliance, mean_p[:3])
-    rows, rows_p = (part[:3] for part in _carried(P, p, cell, 1.0))
+    whole, whole_p = _carried(P, p, cell, 1.0)
+    rows, rows_p = whole[:3], whole_p[:3]
     if cell.by_push is not None and cell.stretch is not None:
         Q, q = c.add(Q, c.matmul(cell.by_push, P[3:])), c.add(q, c.matvec(cell.by_push, p[3:]))
         rows, rows_p = c.add(rows, c.matmul(cell.stretch, P[3:])), c.add(rows_p, c.matvec(cell.stretch, p[3:]))
     Q, q = c.keep((Q, q), p[0])
-    pivot = c.subtract(_IDENTITY, c.scale(cell.width, Q))
+    less = c.scale(-cell.width, Q)
+    pivot = tuple(tuple(1.0 + x if i == j else x for j, x in enumerate(row)) for i, row in enumerate(less))
     adjugate, det = c.adjugate(pivot)
     # all eigenvalues of a matrix are positive, if they are real, when the coefficients of its characteristic polynomial alternate
     definite = (_trace(pivot) > 0) & (_trace(adjugate) > 0) & (det > 0)
