@@ -23,7 +23,7 @@ class StrainDependent(SteppedModel):
     r"""Strain from the balance of each cross-section, $\xi = \Sigma^{-1} (B_\tau(\xi) \tau + \Lambda) + \xi^*$ (eq. 21).
 
     Without loads $\Lambda = 0$ and the strain is exact; the only error is that of the pose steps. With loads the reaction is
-    that of the steps' shape, and the pose at the ends of the steps keeps nearly their order.
+    that of the steps' shape, and the pose at the ends of the steps keeps their order.
 
     **Arguments:**
     - `steps`: steps along the arm, at least one on each of its smooth pieces, the others by their lengths.
