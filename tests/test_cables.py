@@ -161,6 +161,15 @@ def test_gradients_through_effects(name):
         np.testing.assert_allclose(reverse[i], difference, rtol=1e-4, atol=1e-7 * (1 + abs(reverse[i])), err_msg=f"number {i}, value {x}")
 
 
+def test_reverse_mode_by_the_lengths_alone_is_traced():
+    """Only the cables' rows of the tangent system move then."""
+
+    def height(x):
+        return vsr.solve(scene([vsr.Gravity()], control="length"), x, model=STEPS).tip[2, 3]
+
+    assert jax.eval_shape(jax.grad(height), jnp.array([-0.01, -0.005])).shape == (2,)
+
+
 @pytest.mark.slow
 def test_forward_mode_is_reverse_mode():
     loads = [vsr.Gravity(), vsr.PointWrench(0.15, force=(0.0, 0.05, 0.0), frame="body")]
