@@ -8,13 +8,12 @@ in one run. `vsr-jax effects` prints the same table for a smaller batch.
 
 import argparse
 import json
-import os
-import platform
 from pathlib import Path
 
 import jax
 
 from vsr_jax import effects
+from vsr_jax.timing import machine
 
 BATCH = 1024
 
@@ -26,12 +25,11 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=15, help="how often each solve is timed (15)")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    machine = f"{platform.machine()}, {os.cpu_count()} cores, {jax.devices()[0].device_kind}"
-    print(f"{machine}, jax {jax.__version__}; 16 steps of order 6, {BATCH} in a batch; median (10 %-90 %), x: to the row above", flush=True)
+    print(f"{machine()}, jax {jax.__version__}; 16 steps of order 6, {BATCH} in a batch; median (10 %-90 %), x: to the row above")
     costs = effects.measure(BATCH, options.rounds)
     print("\n".join(effects.table(costs)))
     if options.json:
-        report = {"machine": machine, "jax": jax.__version__, "rows": [cost._asdict() for cost in costs]}
+        report = {"machine": machine(), "jax": jax.__version__, "rows": [cost._asdict() for cost in costs]}
         options.json.parent.mkdir(parents=True, exist_ok=True)
         options.json.write_text(json.dumps(report, indent=1) + "\n")
 

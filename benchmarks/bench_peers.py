@@ -14,8 +14,6 @@ against each other.
 import argparse
 import importlib.metadata
 import json
-import os
-import platform
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -28,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import vsr_jax as vsr
-from vsr_jax.timing import Timed, take_turns
+from vsr_jax.timing import Timed, machine, take_turns
 
 BATCH = 1024
 SINGLES = 5
@@ -212,9 +210,8 @@ def main() -> None:
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     peer = load_peer()
-    machine = f"{platform.machine()}, {os.cpu_count()} cores, {jax.devices()[0].device_kind}"
     versions = {name: importlib.metadata.version(name) for name in ("jax", "soromox")} | {"vsr_jax": vsr.__version__}
-    print(f"{machine}, {', '.join(f'{name} {number}' for name, number in versions.items())}")
+    print(f"{machine()}, {', '.join(f'{name} {number}' for name, number in versions.items())}")
     taus = jnp.asarray(np.random.default_rng(0).uniform(-15, 0, (BATCH, 1)))
     truth, miss = truths(taus)
     print(f"vsr_jax at {TRUTH[0]} steps of order {TRUTH[1]} is {miss:.1e} m from the independent tip at {REFERENCE_TAU} N\n", flush=True)
@@ -224,7 +221,7 @@ def main() -> None:
     print_rows(rows)
     pairs = compare(rows)
     print_pairs(pairs)
-    report: dict[str, Any] = {"machine": machine, "versions": versions, "truth_error": miss, "rows": rows, "pairs": pairs}
+    report: dict[str, Any] = {"machine": machine(), "versions": versions, "truth_error": miss, "rows": rows, "pairs": pairs}
     if options.formulations:
         report["formulations"] = formulations(peer, taus, truth, options.rounds)
     if options.json:

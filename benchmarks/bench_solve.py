@@ -8,8 +8,6 @@ batch, with respect to every number of every routing. `--cold` adds the time fro
 
 import argparse
 import json
-import os
-import platform
 import subprocess
 import sys
 from collections.abc import Callable
@@ -23,7 +21,7 @@ import numpy as np
 
 import vsr_jax as vsr
 from vsr_jax import paper
-from vsr_jax.timing import Timed, take_turns
+from vsr_jax.timing import Timed, machine, take_turns
 
 BATCH = 1024
 REPEATS = 15
@@ -95,7 +93,7 @@ def main() -> None:
     parser.add_argument("--cold", action="store_true", help="measure the cold start as well")
     options = parser.parse_args()
     report: dict[str, Any] = {
-        "machine": f"{platform.machine()}, {os.cpu_count()} cores, {jax.devices()[0].device_kind}",
+        "machine": machine(),
         "jax": jax.__version__,
     }
     if options.cold:

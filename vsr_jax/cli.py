@@ -3,7 +3,7 @@
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -88,13 +88,23 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _command(commands: Any, name: str, *, example: str, run: Callable, more: str = "", **texts: str) -> argparse.ArgumentParser:
+    """A command with an example, `more` under it, and the exit codes at the end of its help."""
+    epilog = f"example:\n  {example}\n{more}\n{_EXIT_CODES}"
+    command = commands.add_parser(name, epilog=epilog, formatter_class=argparse.RawDescriptionHelpFormatter, **texts)
+    command.set_defaults(run=run)
+    return command
+
+
 def _add_solve(commands: Any) -> None:
-    command = commands.add_parser(
+    command = _command(
+        commands,
         "solve",
         help="solve a scene file and print, draw or save the result",
         description="Solves the scene of a TOML file and prints status, tip, stability and threads.",
-        epilog=f"example:\n  vsr-jax solve scene.toml --inputs 8 2.5 --plot arm.png --json arm.json\n{_SCENE_EXAMPLE}\n{_EXIT_CODES}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        example="vsr-jax solve scene.toml --inputs 8 2.5 --plot arm.png --json arm.json",
+        more=_SCENE_EXAMPLE,
+        run=_solve,
     )
     command.add_argument("scene", metavar="SCENE", help="the TOML file")
     command.add_argument("--inputs", metavar="U", nargs="*", type=float, help="one number an actuator (default: those of the file)")
@@ -106,38 +116,37 @@ def _add_solve(commands: Any) -> None:
     command.add_argument("--precision", choices=("float64", "float32"), default="float64", help="of all numbers (default: %(default)s)")
     command.add_argument("--plot", metavar="FILE", help="draw the arm into a picture: .png, .pdf, .svg")
     command.add_argument("--json", metavar="FILE", help="save inputs, status, tip, positions, strains, threads and stability")
-    command.set_defaults(run=_solve)
 
 
 def _add_paper(commands: Any) -> None:
-    command = commands.add_parser(
+    command = _command(
+        commands,
         "paper",
         help="run section IV of the paper anew: table and figures",
         description="Solves the cases of section IV of Renda et al. (2020) with every model, compares them with the reference\n"
         "solutions and writes table.md, table.json, Fig. 2 and, with case A2, Fig. 3 (PNG and PDF). All cases take about\n"
         "two minutes on two cores.",
-        epilog=f"example:\n  vsr-jax paper --out results --cases A2 B1\n\n{_EXIT_CODES}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        example="vsr-jax paper --out results --cases A2 B1",
+        run=_paper,
     )
     command.add_argument("--out", metavar="DIR", default="paper", help="folder for the results, made if need be (default: %(default)s)")
     command.add_argument("--cases", metavar="CASE", nargs="+", help="cases among A1 A2 A3 B1 B2 C1 C2 (default: all)")
-    command.set_defaults(run=_paper)
 
 
 def _add_effects(commands: Any) -> None:
-    command = commands.add_parser(
+    command = _command(
+        commands,
         "effects",
         help="what each effect of a scene costs on this machine",
         description="Adds the effects to one arm, one after another: poses, gravity, a tip wrench, a follower load, a second section,\n"
         "a tendon driven by its length, friction. Prints operations of the compiled program (the body of each loop counted\n"
-        "once), compile time and the times of a solve, alone and in a batch, each against the row above. Takes a minute or two.",
-        epilog=f"example:\n  vsr-jax effects --lanes 64 --json effects.json\n\n{_EXIT_CODES}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        "once), compile time and the times of a solve, alone and in a batch, each against the row above. Takes a few minutes.",
+        example="vsr-jax effects --lanes 64 --json effects.json",
+        run=_effects,
     )
     command.add_argument("--lanes", type=_positive, default=256, help="shapes in the batch (default: %(default)s)")
     command.add_argument("--steps", type=_positive, default=16, help="steps along the arm (default: %(default)s)")
     command.add_argument("--json", metavar="FILE", help="save the figures")
-    command.set_defaults(run=_effects)
 
 
 def _positive(text: str) -> int:

@@ -2,8 +2,9 @@
 
 A vector is a tuple of three arrays, a twist or a wrench a tuple of six (angular part first), a matrix a tuple of rows.
 All components share one shape: a scalar for a single cross-section, `(nodes,)` along an arm, with a batch axis in front
-under `jax.vmap`. Written this way the kernels are plain elementwise arithmetic, which XLA fuses into a few loops;
-small batched `dot_general`, `concatenate` and LAPACK calls, which it cannot fuse, never appear.
+under `jax.vmap` (the solver of loaded arms puts its batch last). Written this way the kernels are plain elementwise
+arithmetic, which XLA fuses into a few loops; small batched `dot_general`, `concatenate` and LAPACK calls, which it cannot
+fuse, never appear.
 """
 
 import operator
@@ -15,8 +16,6 @@ from jaxtyping import Array
 
 Vector = tuple[Array, ...]
 Matrix = tuple[Vector, ...]
-
-
 Tree = TypeVar("Tree")
 
 

@@ -54,9 +54,6 @@ def _solve_arm_jvp(kind: Kind, primals: tuple[Problem], tangents: tuple[Problem]
     free, others = chosen(solution.unknown.xi, kind.free), solution.unknown[1:]
     still = jax.tree.map(jnp.zeros_like, Imbalance(free, *others))
     _, right = jax.jvp(lambda problem: imbalance(still, problem), primals, tangents)
-    # custom_linear_solve has a transpose only if all of its right side is linear in the tangents; rows that nothing moves are not
-    tie = 0.0 * sum((jnp.sum(x) for x in jax.tree.leaves(right)), jnp.zeros_like(right.wrench[0][0, 0]))
-    right = jax.tree.map(lambda x: x + tie, right)
     change = tangent_solve(
         lambda change: imbalance(change, primals[0]), placed(still, primals[0]), harmless(primals[0], sound), right, kind
     )

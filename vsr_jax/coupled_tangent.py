@@ -63,6 +63,9 @@ def _tensions(unknown: Unknown, at: State, right: Imbalance, problem: Problem, k
 
 def tangent_solve(imbalance: Callable, unknown: Unknown, problem: Problem, right: Imbalance, kind: Kind) -> Imbalance:
     """Solution of the exact tangent system: what `approximate_solve` leaves is solved for again, until nothing is left."""
+    # custom_linear_solve has a transpose only if all of its right side is linear in the tangents; rows that nothing moves are not
+    tie = 0.0 * sum((jnp.sum(x) for x in jax.tree.leaves(right)), jnp.zeros_like(right.wrench[0][0, 0]))
+    right = jax.tree.map(lambda x: x + tie, right)
     still = jax.tree.map(jnp.zeros_like, right)
     _, matvec = jax.linearize(imbalance, still)
     at = state_of(unknown, problem, kind)

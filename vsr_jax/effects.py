@@ -11,6 +11,7 @@ import numpy as np
 from .actuator import Tendon
 from .load import Gravity, PointWrench, TipWrench
 from .material import Material
+from .model import Status
 from .profile import Piecewise
 from .rod import Rod
 from .routing import Helix, Parallel
@@ -99,7 +100,7 @@ def _jobs(rung: Rung, model: StrainDependent, scale: np.ndarray) -> tuple[Timed,
         scene = eqx.combine(values, fixed)
         if not rung.pose:
             outcome = model.solve(scene, inputs)
-            return outcome.state.xi, outcome.status == 0
+            return outcome.state.xi, outcome.status == Status.CONVERGED
         eq = solve(scene, inputs, model=model)
         return eq.tip, eq.converged
 

@@ -24,7 +24,7 @@ from . import component as c
 from .balance import chosen, chosen_rows, spread
 from .component import Matrix, Vector
 from .quadrature import Grid
-from .reaction import Loading, Reaction
+from .reaction import Loading, Reaction, turned
 
 
 class Cell(NamedTuple):
@@ -191,10 +191,7 @@ def _jumps(along: Reaction, loads: Loading, grid: Grid) -> Vector | None:
         place = jnp.zeros((grid.X.shape[0], *step.shape), grid.h.dtype).at[-1].set(step.astype(grid.h.dtype))
         here = c.scale(place, wrench)
         total = here if total is None else c.add(total, here)
-    if total is None:
-        return None
-    back = c.transpose(along.rotation)
-    return (*c.matvec(back, total[:3]), *c.matvec(back, total[3:]))
+    return None if total is None else turned(c.transpose(along.rotation), total)
 
 
 def _cell(end: tuple[Matrix, Vector], cell: Cell) -> tuple[tuple[Matrix, Vector], tuple]:
@@ -213,8 +210,8 @@ def _cell(end: tuple[Matrix, Vector], cell: Cell) -> tuple[tuple[Matrix, Vector]
     adjugate, det = c.adjugate(pivot)
     # all eigenvalues of a matrix are positive, if they are real, when the coefficients of its characteristic polynomial alternate
     definite = (_trace(pivot) > 0) & (_trace(adjugate) > 0) & (det > 0)
-    X = jax.tree.map(lambda entry: entry / det, c.matmul(adjugate, c.add(Q, cell.by_theta)))
-    x = jax.tree.map(lambda entry: entry / det, c.matvec(adjugate, c.add(q, cell.bend)))
+    solved = c.matmul(adjugate, c.add(Q, cell.by_theta)), c.matvec(adjugate, c.add(q, cell.bend))
+    X, x = jax.tree.map(lambda entry: entry / det, solved)
     by_bend = c.add(c.scale(cell.width, rows), cell.by_bend)
     start = c.add(c.add(rows, cell.moment), c.matmul(by_bend, X))
     start_p = c.add(c.add(rows_p, cell.moment_0), c.matvec(by_bend, x))

@@ -110,7 +110,6 @@ def damped_newton(
     **Returns:** a `Solution`; it balances if the residual at the end is rounding or as small as a negligible step.
     """
     small = jnp.finfo(floor.dtype).eps ** 0.75
-    part = 1.0 / shares
 
     def raised(mu: Array) -> Array:
         return jnp.maximum(_RAISE * mu, _LEAST_DAMPING)
@@ -119,32 +118,32 @@ def damped_newton(
         return jnp.where(mu > 1e-2 * _LEAST_DAMPING, mu / _LOWER, 0.0)
 
     def pending(state: tuple) -> Array:
-        _, at, mu, share, fresh, count = state
+        _, at, mu, given, fresh, count = state
         done = fresh & (mu == 0) & ((at.size < small) | (at.merit < floor))
         stuck = ~at.definite & (at.merit < floor)
-        return (count < MAX_DAMPED_STEPS) & ~((done | stuck) & (share == 1)) & (mu < _MOST_DAMPING)
+        return (count < MAX_DAMPED_STEPS) & ~((done | stuck) & (given == shares)) & (mu < _MOST_DAMPING)
 
     def advance(state: tuple) -> tuple:
         go = pending(state)
         return jax.tree.map(lambda new, old: jnp.where(go, new, old), stepped(state), state)
 
     def stepped(state: tuple) -> tuple:
-        x, at, mu, share, fresh, count = state
+        x, at, mu, given, fresh, count = state
         trial = jax.tree.map(lambda a, s: jnp.where(fresh, a - s, a), x, at.step)
         mu_new = jnp.where(fresh, lowered(mu), mu)
-        share_new = jnp.where(fresh & (share < 1), jnp.where(share + 1.5 * part < 1, share + part, 1.0), share)
-        new = evaluate(trial, mu_new, share_new)
+        given_new = jnp.where(fresh, jnp.minimum(given + 1, shares), given)
+        new = evaluate(trial, mu_new, given_new / shares)
         downhill = work(new.residual, at.step) >= -work(at.residual, at.step)
-        better = (share < 1) | downhill | (new.merit < at.merit) | (new.merit < floor)
+        better = (given < shares) | downhill | (new.merit < at.merit) | (new.merit < floor)
         taken = ~fresh | (jnp.isfinite(new.merit) & better)
-        x, at, share = jax.tree.map(lambda a, b: jnp.where(taken, a, b), (trial, new, share_new), (x, at, share))
+        x, at, given = jax.tree.map(lambda a, b: jnp.where(taken, a, b), (trial, new, given_new), (x, at, given))
         mu = jnp.where(taken, jnp.where(new.definite, mu_new, raised(mu_new)), raised(mu))
-        return x, at, mu, share, taken & new.definite, count + 1
+        return x, at, mu, given, taken & new.definite, count + 1
 
     first = jax.eval_shape(evaluate, start, floor, floor)
     at = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), first)
     at = at._replace(merit=jnp.full_like(floor, jnp.inf), definite=jnp.ones(floor.shape, bool))
-    mu, share = jnp.full_like(floor, _LEAST_DAMPING if shares == 1 else 0.0), jnp.full_like(floor, part)
-    state = (start, at, mu, share, jnp.zeros(floor.shape, bool), jnp.zeros(floor.shape, jnp.int32))
+    mu = jnp.full_like(floor, _LEAST_DAMPING if shares == 1 else 0.0)
+    state = (start, at, mu, jnp.ones_like(floor), jnp.zeros(floor.shape, bool), jnp.zeros(floor.shape, jnp.int32))
     x, at, _, _, _, count = lax.while_loop(lambda state: jnp.any(pending(state)), advance, state)
     return Solution(x, at.merit <= jnp.maximum(64 * floor, small), at.definite, count)

@@ -131,21 +131,21 @@ def react(xi: Vector, grid: Grid, loads: Loading) -> Reaction:
     m, n = (zero, zero) if loads.dead is None else (loads.dead[:3], loads.dead[3:])
     back = c.transpose(R)
     density = (*zero, *zero) if loads.dead_density is None else loads.dead_density
-    body_density = _turn(back, density)
-    points = tuple(_turn(_rotation_at(starts, end, point.step), point.wrench) for point in loads.follower_points)
-    for point, turned in zip(loads.follower_points, points, strict=True):
-        m, n = c.add(m, c.scale(point.before, turned[:3])), c.add(n, c.scale(point.before, turned[3:]))
+    body_density = turned(back, density)
+    points = tuple(turned(_rotation_at(starts, end, point.step), point.wrench) for point in loads.follower_points)
+    for point, wrench in zip(loads.follower_points, points, strict=True):
+        m, n = c.add(m, c.scale(point.before, wrench[:3])), c.add(n, c.scale(point.before, wrench[3:]))
     follower = None
     if loads.follower_density is not None:
-        follower = turned = _turn(R, loads.follower_density)
-        density, body_density = c.add(density, turned), c.add(body_density, loads.follower_density)
-        along = beyond(turned, grid)
+        follower = turned(R, loads.follower_density)
+        density, body_density = c.add(density, follower), c.add(body_density, loads.follower_density)
+        along = beyond(follower, grid)
         m, n = c.add(m, along[:3]), c.add(n, along[3:])
     axis = c.matvec(R, xi[3:])
     arm = c.cross(axis, n)
     m = c.add(m, beyond(arm, grid))
     density = (*c.add(density[:3], arm), *density[3:])
-    wrench = _turn(back, (*m, *n))
+    wrench = turned(back, (*m, *n))
     return Reaction(starts, R, (*m, *n), density, wrench, axis, points, follower, body_density)
 
 
@@ -160,10 +160,11 @@ def react_at(xi: Vector, grid: Grid, loads: Loading, X: Array) -> Vector:
         wrench[0, step] + within(q, grid, step, first) - within(q, grid, step, sigma)
         for wrench, q in zip(along.world, along.density, strict=True)
     )
-    return _turn(c.transpose(R), world)
+    return turned(c.transpose(R), world)
 
 
-def _turn(R: Matrix, wrench: Vector) -> Vector:
+def turned(R: Matrix, wrench: Vector) -> Vector:
+    """Moment and force of a wrench, each turned by a rotation."""
     return (*c.matvec(R, wrench[:3]), *c.matvec(R, wrench[3:]))
 
 

@@ -84,9 +84,7 @@ def exp_components(omega: Vector) -> tuple[Matrix, Vector]:
 
 def skew(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
     r"""Matrix $\tilde v$ with $\tilde v w = v \times w$."""
-    x, y, z = v
-    zero = jnp.zeros_like(x)
-    return jnp.stack([jnp.stack([zero, -z, y]), jnp.stack([z, zero, -x]), jnp.stack([-y, x, zero])])
+    return c.join_matrix(c.skew(c.split(v)))
 
 
 def hat(xi: Twist) -> Pose:

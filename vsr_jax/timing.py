@@ -1,5 +1,7 @@
 """What a function costs: operations, compile time and the times of its warm calls."""
 
+import os
+import platform
 import time
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -50,6 +52,11 @@ class Timed:
         low, median, high = (float(x) for x in np.quantile(self.samples, [0.1, 0.5, 0.9]))
         cpu = float(np.median(self.cpu_samples))
         return {"compile_s": self.compile_s, "median_us": median, "low_us": low, "high_us": high, "cpu_us": cpu}
+
+
+def machine() -> str:
+    """The machine in words: architecture, cores and device."""
+    return f"{platform.machine()}, {os.cpu_count()} cores, {jax.devices()[0].device_kind}"
 
 
 def take_turns(jobs: Iterable[Timed], rounds: int) -> None:
