@@ -29,6 +29,11 @@ def keep(tree: Tree, like: Array) -> Tree:
     return jax.tree.map(lambda x: x / one, tree)
 
 
+def single(tree: Tree) -> Tree:
+    """The same values in single precision; integers and truth values as they are."""
+    return jax.tree.map(lambda x: x.astype(jnp.float32) if jnp.issubdtype(x.dtype, jnp.floating) else x, tree)
+
+
 def split(array: Array) -> Vector:
     """Components of the last axis of `array`."""
     return tuple(array[..., i] for i in range(array.shape[-1]))

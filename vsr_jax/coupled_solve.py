@@ -20,6 +20,9 @@ from .quadrature import Grid
 _MOST_TURN = 1.5
 """Bound on how far [rad] one Newton step may turn the arm's end."""
 
+_ALIASED = 64
+"""Arms side by side come in no multiple of this: their rows would all fall on the same few lines of a processor's cache."""
+
 
 @partial(jax.custom_jvp, nondiff_argnums=(1,))
 def solve_arm(problem: Problem, kind: Kind) -> Solution:
@@ -66,12 +69,12 @@ def _solve_arm_jvp(kind: Kind, primals: tuple[Problem], tangents: tuple[Problem]
 
 
 def _start(problem: Problem, kind: Kind) -> Unknown:
-    """Balance of each section alone, without loads, cables slack and without friction."""
+    """Balance of each section alone, without loads, cables slack and without friction, in single precision."""
     tension = (jnp.zeros_like(problem.grid.h[0]),) * len(kind.cables)
     tau = problem.sections.carry(with_tensions(problem.forces, tension, kind))
-    alone = solve_balance(problem.sections, tau, None, kind.free)
+    alone = solve_balance(*c.single((problem.sections, tau)), None, kind.free)
     sound = alone.balanced & alone.definite
-    xi = tuple(jnp.where(sound, x, rest) for x, rest in zip(alone.xi, problem.sections.rest, strict=True))
+    xi = tuple(jnp.where(sound, x.astype(rest.dtype), rest) for x, rest in zip(alone.xi, problem.sections.rest, strict=True))
     return Unknown(xi, tension, (jnp.zeros_like(xi[0]),) * len(kind.rubbing))
 
 
@@ -79,7 +82,8 @@ def _side_by_side(kind: Kind) -> Callable[[Unknown, Problem], Solution]:
     """`_solve` with another rule for `jax.vmap`: the batch goes into the last axis.
 
     Passes along the arm then read and write whole rows. With the batch in front every array that goes through a pass is
-    transposed on the way in and out, which took most of the time.
+    transposed on the way in and out, which took most of the time. Eight more arms, copies of the last, cost less than rows of
+    a power of two.
     """
 
     @custom_vmap
@@ -88,9 +92,11 @@ def _side_by_side(kind: Kind) -> Callable[[Unknown, Problem], Solution]:
 
     @solve.def_vmap
     def _(size: int, batched: list, *arguments: Any) -> tuple[Solution, Any]:
-        rows = jax.tree.map(lambda x, along: jnp.moveaxis(x, 0, -1) if along else x[..., None], arguments, tuple(batched))
-        start = jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], size)), rows[0])
-        solution = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), solve(start, rows[1]))
+        lanes = size + 8 if size % _ALIASED == 0 else size
+        place = jnp.minimum(jnp.arange(lanes), size - 1)
+        rows = jax.tree.map(lambda x, along: jnp.moveaxis(x[place], 0, -1) if along else x[..., None], arguments, tuple(batched))
+        start = jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], lanes)), rows[0])
+        solution = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0)[:size], solve(start, rows[1]))
         return solution, jax.tree.map(lambda _: True, solution)
 
     return solve
@@ -114,7 +120,8 @@ class _Sizes(NamedTuple):
 
     def of_step(self, step: Unknown, at: State) -> Array:
         """Largest change of a strain, a tension or a turning rate."""
-        moved = self._largest(jnp.sqrt(c.dot(step.xi, c.multiply(self.stiffness, step.xi)) / self.stiffness[3]))
+        moved = tuple(jnp.sqrt(s / self.stiffness[3]).astype(x.dtype) * x for s, x in zip(self.stiffness, step.xi, strict=True))
+        moved = jnp.sqrt(self._largest(c.dot(moved, moved)))
         return sum((self._largest(x) for x in self._others(step.tension, step.turning, at)), moved)
 
     def of_imbalance(self, imbalance: Imbalance, at: State) -> Array:
@@ -126,12 +133,12 @@ class _Sizes(NamedTuple):
 
     def turn(self, step: Unknown) -> Array:
         """How far the step bends and twists the arm in all [rad]."""
-        x, y, z = (jnp.sum(self.grid.weight * jnp.abs(k), axis=(0, 1)) for k in step.xi[:3])
-        return x + y + z
+        x, y, z = (jnp.abs(k) for k in step.xi[:3])
+        return jnp.sum(self.grid.weight * (x + y + z), axis=(0, 1))
 
     def work(self, wrench: Vector, step: Unknown) -> Array:
-        """Work of the imbalance over a step."""
-        return jnp.sum(self.grid.weight * c.dot(wrench, chosen(step.xi, self.kind.free)), axis=(0, 1))
+        """Work of the imbalance over a step; only its sign and its rough size matter."""
+        return jnp.sum(c.single(self.grid.weight) * c.dot(wrench, chosen(step.xi, self.kind.free)), axis=(0, 1))
 
     def _others(self, forces: Vector, rates: Vector, at: State) -> list[Array]:
         """A force by the axial stiffness, a turning rate by what friction makes of it."""
@@ -155,8 +162,9 @@ def _solve(start: Unknown, whole: Problem, kind: Kind) -> Solution:
         step, definite = approximate_solve(unknown, at, imbalance, problem, kind, damping)
         size = sizes.of_step(step, at)
         # A step that coils the arm may well lower the residual, and lead nowhere.
-        step = c.scale(jnp.minimum(1.0, _MOST_TURN / jnp.maximum(sizes.turn(step), _MOST_TURN)), step)
-        return Damped(step, size, imbalance.wrench, sizes.of_imbalance(imbalance, at), definite)
+        cut = jnp.minimum(1.0, _MOST_TURN / jnp.maximum(sizes.turn(step), _MOST_TURN))
+        step = jax.tree.map(lambda x: cut.astype(x.dtype) * x, step)
+        return Damped(step, size, c.single(imbalance.wrench), sizes.of_imbalance(imbalance, at), definite)
 
     floor = jnp.max(rounding_floor(sizes.stiffness, whole.forces), axis=(0, 1)) * (1 + size_of_loads(whole))
     shares = 1 if whole.loads is None else LOAD_SHARES

@@ -20,7 +20,12 @@ _REFINEMENTS = 30
 def approximate_solve(
     unknown: Unknown, at: State, right: Imbalance, problem: Problem, kind: Kind, damping: Array | float = 0.0
 ) -> tuple[Unknown, Array]:
-    """Solution of the tangent system, nearly (see `elimination`; friction's own tangent is left out), and whether it is definite."""
+    """Solution of the tangent system, nearly (see `elimination`; friction's own tangent is left out), and whether it is definite.
+
+    In single precision throughout, the solution too: the passes along the arm move memory more than they compute, and what
+    is lost is far less than what the elimination leaves out.
+    """
+    unknown, at, right, problem, damping = c.single((unknown, at, right, problem, jnp.asarray(damping)))
     sections, grid = problem.sections, problem.grid
     lower = tangent(unknown.xi, sections, at.tau)
     lower = tuple((*row[:-1], row[-1] + damping * s) for row, s in zip(lower, sections.stiffness, strict=True))
@@ -72,6 +77,7 @@ def tangent_solve(imbalance: Callable, unknown: Unknown, problem: Problem, right
 
     def nearly(b: Imbalance) -> Imbalance:
         step, _ = approximate_solve(unknown, at, b, problem, kind)
+        step = jax.tree.map(lambda x: x.astype(problem.grid.h.dtype), step)
         return Imbalance(chosen(step.xi, kind.free), step.tension, step.turning)
 
     def refine(apply: Callable, precondition: Callable, b: Imbalance) -> Imbalance:

@@ -77,11 +77,15 @@ def eliminate(
     if along is None or loads is None or min(free) > 2:
         x = c.cholesky_solve(c.cholesky(chosen_rows(lower, free)), chosen(right, free))
         return spread(x, free), ~jnp.any(jnp.isnan(x[-1]), axis=(0, 1))
-    lower, right, wrench, rotation = c.keep((lower, right, along.wrench, along.rotation), xi[0])
-    along = along._replace(wrench=wrench, rotation=rotation)
-    cells, linear, local = _cells(lower, right, xi, along, loads, grid, free)
-    cells = jax.tree.map(_flat, cells)
-    zero = jnp.zeros_like(right[0][0, 0])
+    flat = jax.tree.map(_flat, (lower, right, xi, along.wrench, along.rotation))
+    lower, right, xi, wrench, rotation = c.keep(flat, flat[1][0])
+    density = jax.tree.map(_flat, loads.follower_density)
+    cells, linear, local = _cells(lower, right, xi, wrench, rotation, density, _flat(grid.weight), free)
+    if loads.follows:
+        cells = cells._replace(jump=jax.tree.map(_flat, _jumps(along, loads, grid)))
+    else:
+        cells = cells._replace(by_push=None, stretch=None, axis=None)
+    zero = jnp.zeros_like(right[0][0])
     nothing = (zero, zero, zero)
     size = 6 if loads.follows else 3
     _, (X, x, push, definite) = lax.scan(_cell, ((nothing,) * size, (zero,) * size), cells, reverse=True)
@@ -92,13 +96,12 @@ def eliminate(
         return c.matvec(c.transpose(turn), c.add(theta, c.scale(width, kappa))), (theta, kappa)
 
     _, (theta, kappa) = lax.scan(forward, nothing, (X, x, cells.turn, cells.width))
-    if push is not None:
-        push = c.add(c.matvec(push[0], c.add(theta, c.scale(cells.width, kappa))), push[1])
-    theta, kappa, push = jax.tree.map(lambda x: _unflat(x, grid), (theta, kappa, push))
     force = c.add(c.matvec(linear.by_theta, theta), linear.right)
-    force = force if push is None else c.add(force, push)
+    if push is not None:
+        force = c.add(force, c.add(c.matvec(push[0], c.add(theta, c.scale(cells.width, kappa))), push[1]))
     upsilon = c.subtract(c.matvec(linear.flexibility, force), c.matvec(linear.by_bend, kappa))
-    return (*kappa, *upsilon), jnp.all(definite, axis=0) & jnp.all(local, axis=(0, 1))
+    strain = tuple(_unflat(x, grid) for x in (*kappa, *upsilon))
+    return strain, jnp.all(definite & local, axis=0)
 
 
 def _flat(x: Array) -> Array:
@@ -111,16 +114,22 @@ def _unflat(x: Array, grid: Grid) -> Array:
 
 
 def _cells(
-    lower: Matrix, right: Vector, xi: Vector, along: Reaction, loads: Loading, grid: Grid, free: tuple[int, ...]
+    lower: Matrix,
+    right: Vector,
+    xi: Vector,
+    wrench: Vector,
+    rotation: Matrix,
+    density: Vector | None,
+    w: Array,
+    free: tuple[int, ...],
 ) -> tuple[Cell, Linear, Array]:
-    """All that does not depend on P, for all nodes at once, and whether nothing is unstable yet."""
-    w, half = grid.weight, 0.5 * grid.weight
-    m, n, u = c.skew(along.wrench[:3]), c.skew(along.wrench[3:]), c.skew(xi[3:])
+    """All that does not depend on P, for all nodes at once, and whether nothing is unstable yet; `density`: of follower loads."""
+    half = 0.5 * w
+    m, n, u = c.skew(wrench[:3]), c.skew(wrench[3:]), c.skew(xi[3:])
     moment, by_force, force = c.matmul(n, u), n, None  # changes with the rotation, less what P adds
-    if loads.follower_density is not None:
-        couple, density = (c.skew(part) for part in (loads.follower_density[:3], loads.follower_density[3:]))
-        force = c.scale(-half, density)
-        moment, by_force = c.subtract(c.add(moment, c.matmul(u, force)), couple), c.add(n, force)
+    if density is not None:
+        force = c.scale(-half, c.skew(density[3:]))
+        moment, by_force = c.subtract(c.add(moment, c.matmul(u, force)), c.skew(density[:3])), c.add(n, force)
     moment = c.keep(c.scale(half, moment), xi[0])
     by_theta, H = c.add(moment, m), c.symmetric(lower)
     flexibility, rigid = _inverse(tuple(row[3:] for row in H[3:]), tuple(i - 3 for i in free if i > 2))
@@ -139,23 +148,27 @@ def _cells(
     lever = c.scale(-w, n)  # the moment over the cell that a linear strain makes
     cell = Cell(
         w,
-        _turns(along.rotation, grid),
+        _turns(rotation),
         compliance,
         c.matmul(compliance, drive),
         c.matvec(compliance, bend),
         c.add(c.scale(2.0, moment), c.matmul(lever, moved)),
         c.subtract(c.scale(w, moment), c.matmul(lever, by_bend)),
         c.matvec(lever, pushed),
+        c.scale(-1.0, c.matmul(compliance, D)),
+        c.matmul(lever, flexibility),
+        xi[3:],
+        force,
     )
-    if loads.follows:
-        by_push, stretch = c.scale(-1.0, c.matmul(compliance, D)), c.matmul(lever, flexibility)
-        cell = cell._replace(by_push=by_push, stretch=stretch, axis=xi[3:], force=force, jump=_jumps(along, loads, grid))
     return cell, Linear(flexibility, by_force, right[3:], by_bend), rigid & stable
 
 
 def _inverse(matrix: Matrix, places: tuple[int, ...]) -> tuple[Matrix, Array]:
     """Inverse of the block of a matrix of three rows at some places, zero elsewhere, and whether its leading minors are positive."""
     zero = jnp.zeros_like(matrix[0][0])
+    # the cube of a thin arm's stiffness is beyond single precision
+    scale = sum((jnp.abs(matrix[i][i]) for i in places), zero)
+    matrix = tuple(tuple(x / scale for x in row) for row in matrix)
     if len(places) == 3:
         adjugate, det = c.adjugate(matrix)
         definite = (matrix[0][0] > 0) & (adjugate[2][2] > 0) & (det > 0)
@@ -168,17 +181,16 @@ def _inverse(matrix: Matrix, places: tuple[int, ...]) -> tuple[Matrix, Array]:
         definite = det > 0
     else:
         return ((zero,) * 3,) * 3, jnp.ones_like(zero, bool)
-    entries = {(i, j): adjugate[p][q] / det for p, i in enumerate(places) for q, j in enumerate(places)}
+    entries = {(i, j): adjugate[p][q] / (det * scale) for p, i in enumerate(places) for q, j in enumerate(places)}
     return tuple(tuple(entries.get((i, j), zero) for j in range(3)) for i in range(3)), definite
 
 
-def _turns(R: Matrix, grid: Grid) -> Matrix:
+def _turns(R: Matrix) -> Matrix:
     """Rotation of the next node's section as seen from each node's; that of the last is the identity."""
-    flat = jax.tree.map(_flat, R)
-    relative = c.matmul(c.transpose(jax.tree.map(lambda x: x[:-1], flat)), jax.tree.map(lambda x: x[1:], flat))
+    relative = c.matmul(c.transpose(jax.tree.map(lambda x: x[:-1], R)), jax.tree.map(lambda x: x[1:], R))
 
     def followed(x: Array, last: float) -> Array:
-        return _unflat(jnp.concatenate([x, jnp.full_like(x[:1], last)]), grid)
+        return jnp.concatenate([x, jnp.full_like(x[:1], last)])
 
     return tuple(tuple(followed(x, float(i == j)) for j, x in enumerate(row)) for i, row in enumerate(relative))
 

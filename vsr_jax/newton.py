@@ -8,6 +8,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from .component import Tree
+
 MAX_STEPS = 50
 MAX_DAMPED_STEPS = 200
 LOAD_SHARES = 5
@@ -59,7 +61,7 @@ def newton(evaluate: Callable[[Any], Evaluation], start: Any, floor: Array) -> R
         trial = jax.tree.map(lambda a, s: a - fraction * s, x, at.step)
         new = evaluate(trial)
         better = (new.merit < at.merit) | (new.merit < floor)
-        x, at = jax.tree.map(lambda a, b: jnp.where(better, a, b), (trial, new), (x, at))
+        x, at = _where(better, (trial, new), (x, at))
         return x, at, jnp.where(better, jnp.ones_like(fraction), fraction / 4), count + 1
 
     still = jax.tree.map(jnp.zeros_like, start)
@@ -111,39 +113,58 @@ def damped_newton(
     """
     small = jnp.finfo(floor.dtype).eps ** 0.75
 
-    def raised(mu: Array) -> Array:
-        return jnp.maximum(_RAISE * mu, _LEAST_DAMPING)
-
-    def lowered(mu: Array) -> Array:
-        return jnp.where(mu > 1e-2 * _LEAST_DAMPING, mu / _LOWER, 0.0)
-
-    def pending(state: tuple) -> Array:
-        _, at, mu, given, fresh, count = state
-        done = fresh & (mu == 0) & ((at.size < small) | (at.merit < floor))
-        stuck = ~at.definite & (at.merit < floor)
-        return (count < MAX_DAMPED_STEPS) & ~((done | stuck) & (given == shares)) & (mu < _MOST_DAMPING)
+    def pending(guard: _Guard) -> Array:
+        done = guard.fresh & (guard.damping == 0) & ((guard.size < small) | (guard.merit < floor))
+        stuck = ~guard.definite & (guard.merit < floor)
+        enough = (done | stuck) & (guard.given == shares)
+        return (guard.count < MAX_DAMPED_STEPS) & ~enough & (guard.damping < _MOST_DAMPING)
 
     def advance(state: tuple) -> tuple:
-        go = pending(state)
-        return jax.tree.map(lambda new, old: jnp.where(go, new, old), stepped(state), state)
+        x, step, old = state
+        trial = jax.tree.map(lambda a, s: jnp.where(old.fresh, a - s.astype(a.dtype), a), x, step)
+        damping = jnp.where(old.fresh, _lowered(old.damping), old.damping)
+        given = jnp.where(old.fresh, jnp.minimum(old.given + 1, shares), old.given)
+        new = evaluate(trial, damping, given / shares)
+        better = (old.given < shares) | (work(new.residual, step) >= -old.pull) | (new.merit < old.merit) | (new.merit < floor)
+        taken = ~old.fresh | (jnp.isfinite(new.merit) & better)
+        damping = jnp.where(taken & new.definite, damping, _raised(jnp.where(taken, damping, old.damping)))
+        there = _Guard(new.size, new.merit, new.definite, work(new.residual, new.step), damping, given, new.definite, old.count)
+        here = old._replace(damping=damping, fresh=jnp.zeros_like(taken))
+        guard = _where(taken, there, here)._replace(count=old.count + 1)
+        # a step that is not taken is found anew with more damping before it is used, and that of a problem that is done never is
+        go = pending(old)
+        return _where(go & taken, trial, x), new.step, _where(go, guard, old)
 
-    def stepped(state: tuple) -> tuple:
-        x, at, mu, given, fresh, count = state
-        trial = jax.tree.map(lambda a, s: jnp.where(fresh, a - s, a), x, at.step)
-        mu_new = jnp.where(fresh, lowered(mu), mu)
-        given_new = jnp.where(fresh, jnp.minimum(given + 1, shares), given)
-        new = evaluate(trial, mu_new, given_new / shares)
-        downhill = work(new.residual, at.step) >= -work(at.residual, at.step)
-        better = (given < shares) | downhill | (new.merit < at.merit) | (new.merit < floor)
-        taken = ~fresh | (jnp.isfinite(new.merit) & better)
-        x, at, given = jax.tree.map(lambda a, b: jnp.where(taken, a, b), (trial, new, given_new), (x, at, given))
-        mu = jnp.where(taken, jnp.where(new.definite, mu_new, raised(mu_new)), raised(mu))
-        return x, at, mu, given, taken & new.definite, count + 1
+    zero, no = jnp.zeros_like(floor), jnp.zeros(floor.shape, bool)
+    damping = jnp.full_like(floor, _LEAST_DAMPING if shares == 1 else 0.0)
+    guard = _Guard(zero, zero + jnp.inf, ~no, zero, damping, zero + 1, no, jnp.zeros(floor.shape, jnp.int32))
+    step = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(evaluate, start, floor, floor).step)
+    x, _, guard = lax.while_loop(lambda state: jnp.any(pending(state[2])), advance, (start, step, guard))
+    return Solution(x, guard.merit <= jnp.maximum(64 * floor, small), guard.definite, guard.count)
 
-    first = jax.eval_shape(evaluate, start, floor, floor)
-    at = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), first)
-    at = at._replace(merit=jnp.full_like(floor, jnp.inf), definite=jnp.ones(floor.shape, bool))
-    mu = jnp.full_like(floor, _LEAST_DAMPING if shares == 1 else 0.0)
-    state = (start, at, mu, jnp.ones_like(floor), jnp.zeros(floor.shape, bool), jnp.zeros(floor.shape, jnp.int32))
-    x, at, _, _, _, count = lax.while_loop(lambda state: jnp.any(pending(state)), advance, state)
-    return Solution(x, at.merit <= jnp.maximum(64 * floor, small), at.definite, count)
+
+class _Guard(NamedTuple):
+    """What `damped_newton` keeps of each problem besides the point and the step: size of the step, of the residual, whether
+    the tangent is definite, the work of the residual over the step; damping, shares of the loads so far, whether the step may
+    be tried, evaluations so far."""
+
+    size: Array
+    merit: Array
+    definite: Array
+    pull: Array
+    damping: Array
+    given: Array
+    fresh: Array
+    count: Array
+
+
+def _raised(damping: Array) -> Array:
+    return jnp.maximum(_RAISE * damping, _LEAST_DAMPING)
+
+
+def _lowered(damping: Array) -> Array:
+    return jnp.where(damping > 1e-2 * _LEAST_DAMPING, damping / _LOWER, 0.0)
+
+
+def _where(condition: Array, a: Tree, b: Tree) -> Tree:
+    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)

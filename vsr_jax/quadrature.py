@@ -8,8 +8,10 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
+from . import component as c
 from ._types import Scalar
 from .component import Vector
 
@@ -87,12 +89,12 @@ def beyond(density: Vector, grid: Grid) -> Vector:
     powers = np.arange(1, stages + 1)
     rest = weights - (nodes[:, None] ** powers / powers) @ interpolation(stages)  # of the integral over a step of length 1
 
-    def integrate(q: Array) -> Array:
-        later = jnp.cumsum(jnp.sum(grid.weight * q, axis=0)[::-1], axis=0)[::-1]
-        whole = jnp.concatenate([later[1:], jnp.zeros_like(later[:1])])
-        return jnp.stack([whole + grid.h * weighted(row, q) for row in rest])
+    def add(total: Vector, part: Vector) -> tuple[Vector, Vector]:
+        return c.add(total, part), total
 
-    return tuple(integrate(q) for q in density)
+    parts = tuple(weighted(weights, grid.h * q) for q in density)
+    _, later = lax.scan(add, tuple(jnp.zeros_like(part[0]) for part in parts), parts, reverse=True)
+    return tuple(jnp.stack([past + grid.h * weighted(row, q) for row in rest]) for past, q in zip(later, density, strict=True))
 
 
 def locate(grid: Grid, X: Array) -> tuple[Array, Array]:
