@@ -117,7 +117,7 @@ def damped_newton(
         done = guard.fresh & (guard.damping == 0) & ((guard.size < small) | (guard.merit < floor))
         stuck = ~guard.definite & (guard.merit < floor)
         enough = (done | stuck) & (guard.given == shares)
-        return (guard.count < MAX_DAMPED_STEPS) & ~enough & (guard.damping < _MOST_DAMPING)
+        return (guard.spent < MAX_DAMPED_STEPS) & ~enough & (guard.damping < _MOST_DAMPING)
 
     def advance(state: tuple) -> tuple:
         x, step, old = state
@@ -128,9 +128,9 @@ def damped_newton(
         better = (old.given < shares) | (work(new.residual, step) >= -old.pull) | (new.merit < old.merit) | (new.merit < floor)
         taken = ~old.fresh | (jnp.isfinite(new.merit) & better)
         damping = jnp.where(taken & new.definite, damping, _raised(jnp.where(taken, damping, old.damping)))
-        there = _Guard(new.size, new.merit, new.definite, work(new.residual, new.step), damping, given, new.definite, old.count)
+        there = _Guard(new.size, new.merit, new.definite, work(new.residual, new.step), damping, given, new.definite, old.spent)
         here = old._replace(damping=damping, fresh=jnp.zeros_like(taken))
-        guard = _where(taken, there, here)._replace(count=old.count + 1)
+        guard = _where(taken, there, here)._replace(spent=old.spent + 1)
         # a step that is not taken is found anew with more damping before it is used, and that of a problem that is done never is
         go = pending(old)
         return _where(go & taken, trial, x), new.step, _where(go, guard, old)
@@ -140,7 +140,7 @@ def damped_newton(
     guard = _Guard(zero, zero + jnp.inf, ~no, zero, damping, zero + 1, no, jnp.zeros(floor.shape, jnp.int32))
     step = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(evaluate, start, floor, floor).step)
     x, _, guard = lax.while_loop(lambda state: jnp.any(pending(state[2])), advance, (start, step, guard))
-    return Solution(x, guard.merit <= jnp.maximum(64 * floor, small), guard.definite, guard.count)
+    return Solution(x, guard.merit <= jnp.maximum(64 * floor, small), guard.definite, guard.spent)
 
 
 class _Guard(NamedTuple):
@@ -155,7 +155,7 @@ class _Guard(NamedTuple):
     damping: Array
     given: Array
     fresh: Array
-    count: Array
+    spent: Array
 
 
 def _raised(damping: Array) -> Array:
