@@ -13,6 +13,7 @@ from .basis import (
     PiecewiseConstant as PiecewiseConstant,
     Trigonometric as Trigonometric,
 )
+from .continuation import Branch as Branch, trace as trace
 from .discrete import (
     Prescribed as Prescribed,
     actuation_matrix as actuation_matrix,
