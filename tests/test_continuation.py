@@ -78,6 +78,14 @@ def test_derivatives_are_those_at_fixed_parameter():
 
 
 @pytest.mark.slow
+def test_a_path_without_a_start_says_so_at_all_points():
+    rod = vsr.Rod(0.3, vsr.Circular(0.01), vsr.Material(1e6, poisson=0.45))
+    scene = vsr.Scene(rod, [vsr.Tendon(vsr.Parallel(0.0, 0.0))])
+    branch = vsr.trace(scene, lambda s: jnp.array([400.0]), model=MODEL, points=5)  # beyond EA the axis collapses
+    assert np.all(branch.equilibria.status == vsr.Status.COLLAPSED)
+
+
+@pytest.mark.slow
 def test_both_branches_of_eulers_column_end_where_a_solve_does():
     def ends(side):
         def pressed(s):

@@ -84,7 +84,8 @@ def trace(
     - `points`: how many points at most. `branch.parameter[-1] < 1` means that they did not reach the end.
     - `step`: longest arc between neighbours; steps are cut where the curve bends.
 
-    **Returns:** a `Branch`. Points after one from which the curve could not be followed have the status `MAX_STEPS`.
+    **Returns:** a `Branch`. Points after one from which the curve could not be followed have the status `MAX_STEPS`; if there is no
+    equilibrium at s = 0 all have the status of that solve.
 
     **Raises:** `ValueError` for another model, and what `solve` raises at s = 0.
     """
@@ -156,15 +157,16 @@ def _trace(scene: Any, path: Any, start: Equilibrium, points: int, step: Array) 
     system, u = _system(scene, path, start)
     along = jnp.zeros_like(u).at[-1].set(1.0)
     zero = jnp.zeros((), jnp.int32)
-    walk = _Walk(u, along, step, zero, jnp.zeros((points, u.size), u.dtype), zero, jnp.zeros(points, jnp.int32), ~start.converged)
+    everywhere = jnp.broadcast_to(u, (points, u.size))
+    walk = _Walk(u, along, step, zero, everywhere, zero, jnp.zeros(points, jnp.int32), ~start.converged)
 
     def proceed(walk: _Walk) -> Array:
         return (walk.found < points) & (walk.cuts < _MOST_CUTS) & ~walk.ended
 
     walk = lax.while_loop(proceed, partial(_attempt, system, step), walk)
-    place = jnp.minimum(jnp.arange(points), walk.found - 1)
-    lost = (jnp.arange(points) >= walk.found) & ((walk.cuts == _MOST_CUTS) | (walk.found == 0))
-    status = jnp.where(lost, Status.MAX_STEPS, Status.CONVERGED).astype(jnp.int32)
+    place = jnp.minimum(jnp.arange(points), jnp.maximum(walk.found - 1, 0))
+    lost = (walk.cuts == _MOST_CUTS) & (jnp.arange(points) >= walk.found)
+    status = jnp.where(lost & start.converged, Status.MAX_STEPS, start.status).astype(jnp.int32)
     us = walk.points[place]
     return Branch(us[:, -1], jax.vmap(partial(_equilibrium, system))(us, status, walk.corrections[place]))
 

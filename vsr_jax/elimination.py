@@ -114,14 +114,7 @@ def _unflat(x: Array, grid: Grid) -> Array:
 
 
 def _cells(
-    lower: Matrix,
-    right: Vector,
-    xi: Vector,
-    wrench: Vector,
-    rotation: Matrix,
-    density: Vector | None,
-    w: Array,
-    free: tuple[int, ...],
+    lower: Matrix, right: Vector, xi: Vector, wrench: Vector, rotation: Matrix, density: Vector | None, w: Array, free: tuple[int, ...]
 ) -> tuple[Cell, Linear, Array]:
     """All that does not depend on P, for all nodes at once, and whether nothing is unstable yet; `density`: of follower loads."""
     half = 0.5 * w
