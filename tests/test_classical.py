@@ -195,6 +195,7 @@ def test_elastica_under_a_dead_force_is_bisshopp_and_druckers(load):
         np.testing.assert_allclose((1 - solved.tip[0], solved.tip[1], solved.angle[-1]), MATTIASSON[load], atol=6e-6)
 
 
+@pytest.mark.slow
 def test_slender_rod_with_all_strains_tends_to_the_elastica_with_the_square_of_its_thickness():
     """EI / EA L^2 and EI / GA L^2 go with the square of thickness over length, and so must the distance from Bisshopp & Drucker's tip."""
     sides, load = np.array([0.04, 0.02, 0.01]), 10.0

@@ -67,6 +67,7 @@ def test_its_stable_equilibria_are_those_of_a_solve(snap):
         np.testing.assert_allclose(single(s[i]), tips[i], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_at_fixed_parameter():
     def traced(density):
         branch = vsr.trace(lambda s: column(s, density), no_inputs, model=MODEL, points=3)

@@ -51,6 +51,7 @@ def test_right_side_is_eq_12_and_13_as_printed(case):
         np.testing.assert_allclose(strain_rate(scene, tau, xi, jnp.asarray(X)), want, rtol=1e-10, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_tolerance_rules_the_error_of_another_solver(helix):
     reference = paper.reference("B1")[0]
     errors = []

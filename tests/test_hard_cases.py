@@ -60,6 +60,7 @@ def test_six_tendons_pulled_at_random_converge(draws):
     assert np.all(margin > 1 - 1e-9)
 
 
+@pytest.mark.slow
 def test_six_tendons_with_random_tip_wrenches_converge(draws):
     def solved(tensions, force, moment):
         return vsr.solve(six_tendon_arm([vsr.TipWrench(force=force, moment=moment)]), tensions, model=MODEL)

@@ -112,6 +112,7 @@ class TestJacobian:
         want = (4 * trapezoid(800) - trapezoid(400)) / 3
         np.testing.assert_allclose(vsr.jacobian(self.scene, self.basis, self.q, steps=64), want, atol=2e-7)
 
+    @pytest.mark.slow
     def test_converges_with_the_order_of_the_steps(self):
         fine = vsr.jacobian(self.scene, self.basis, self.q, steps=128, order=6)
         errors = [np.abs(vsr.jacobian(self.scene, self.basis, self.q, steps=n, order=4) - fine).max() for n in (12, 24)]
