@@ -124,6 +124,11 @@ def spread(vector: Vector, free: tuple[int, ...]) -> Vector:
     return tuple(vector[free.index(i)] if i in free else jnp.zeros_like(vector[0]) for i in range(6))
 
 
+def with_locked(xi: Vector, locked: Vector, free: tuple[int, ...]) -> Vector:
+    """The free strains of `xi` with the others from `locked`."""
+    return tuple(x if i in free else jnp.broadcast_to(y, x.shape) for i, (x, y) in enumerate(zip(xi, locked, strict=True)))
+
+
 @partial(jax.custom_jvp, nondiff_argnums=(3,))
 def solve_balance(sections: CrossSections, tau: Vector, reaction: Vector | None = None, free: tuple[int, ...] = ALL) -> Balance:
     r"""Strain that balances each cross-section (eq. 21), by Newton's method from the rest strain.
@@ -167,11 +172,9 @@ def _solve_balance_jvp(free: tuple[int, ...], primals: tuple, tangents: tuple) -
     xi = tuple(jnp.where(sound, x, rest) for x, rest in zip(solution.xi, sections.rest, strict=True))
 
     def imbalance(sections: CrossSections, tau: Vector, reaction: Vector | None) -> Vector:
-        here = tuple(x if i in free else jnp.broadcast_to(sections.rest[i], x.shape) for i, x in enumerate(xi))
-        return residual(here, sections, forces_where(sound, tau), reaction)
+        return residual(with_locked(xi, sections.rest, free), sections, forces_where(sound, tau), reaction)
 
     _, change = jax.jvp(imbalance, primals, tangents)
     factor = cholesky(chosen_rows(tangent(xi, sections, forces_where(sound, tau)), free))
     change = spread(scale(-1.0, cholesky_solve(factor, chosen(change, free))), free)
-    d_xi = tuple(x if i in free else jnp.broadcast_to(tangents[0].rest[i], x.shape) for i, x in enumerate(change))
-    return solution, Balance(d_xi, *no_derivative(*solution[1:]))
+    return solution, Balance(with_locked(change, tangents[0].rest, free), *no_derivative(*solution[1:]))

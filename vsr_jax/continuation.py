@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from ._check import count, instance, numbers
 from ._types import Scalar, cast
-from .balance import chosen
+from .balance import chosen, spread, with_locked
 from .coupled import Kind, Problem, Unknown, imbalance_of, problem_of, state_of, with_tensions
 from .equilibrium import Equilibrium
 from .model import Outcome, Status
@@ -116,20 +116,20 @@ class _System(NamedTuple):
         scene, inputs = _at(self.scene, self.path, s)
         return problem_of(scene, inputs, self.model.grid(scene))
 
-    def unknown(self, u: Array) -> Unknown:
+    def unknown(self, u: Array, problem: Problem, kind: Kind) -> Unknown:
         """The unknowns in their own form; locked strains have their rest value."""
-        problem, kind = self.problem(u[-1])
         shape, size = problem.grid.X.shape, problem.grid.X.size
         values = u[:-1] / self.scale
         strain = values[: len(kind.free) * size].reshape(-1, *shape)
-        xi = tuple(strain[kind.free.index(i)] if i in kind.free else jnp.broadcast_to(problem.sections.rest[i], shape) for i in range(6))
+        xi = with_locked(spread(tuple(strain), kind.free), problem.sections.rest, kind.free)
         rest = values[strain.size :]
         tension, turning = rest[: len(kind.cables)], rest[len(kind.cables) :].reshape(-1, *shape)
         return Unknown(xi, tuple(tension), tuple(turning))
 
     def residual(self, u: Array) -> Array:
         """Imbalance as the gradient of an energy without unit by `u`."""
-        (problem, kind), unknown = self.problem(u[-1]), self.unknown(u)
+        problem, kind = self.problem(u[-1])
+        unknown = self.unknown(u, problem, kind)
         rows = imbalance_of(unknown, state_of(unknown, problem, kind), problem, kind)
         wrench = tuple(problem.grid.weight * r for r in rows.wrench)
         flat = jnp.concatenate([jnp.ravel(x) for x in (*wrench, *rows.cable, *rows.turning)])
@@ -155,10 +155,9 @@ def _system(scene: Any, path: Any, start: Equilibrium) -> tuple[_System, Array]:
 @eqx.filter_jit
 def _trace(scene: Any, path: Any, start: Equilibrium, points: int, step: Array) -> Branch:
     system, u = _system(scene, path, start)
-    along = jnp.zeros_like(u).at[-1].set(1.0)
     zero = jnp.zeros((), jnp.int32)
     everywhere = jnp.broadcast_to(u, (points, u.size))
-    walk = _Walk(u, along, step, zero, everywhere, zero, jnp.zeros(points, jnp.int32), ~start.converged)
+    walk = _Walk(u, _last_axis(u), step, zero, everywhere, zero, jnp.zeros(points, jnp.int32), ~start.converged)
 
     def proceed(walk: _Walk) -> Array:
         return (walk.found < points) & (walk.cuts < _MOST_CUTS) & ~walk.ended
@@ -176,11 +175,10 @@ def _attempt(system: _System, longest: Array, walk: _Walk) -> _Walk:
     first = walk.found == 0
     goal, row, length, over = _aim(walk, first)
     u, J, size, count = _corrected(system, goal, row)
-    tangent = jnp.linalg.solve(jnp.concatenate([J, walk.tangent[None]]), jnp.zeros_like(u).at[-1].set(1.0))
+    tangent = jnp.linalg.solve(jnp.concatenate([J, walk.tangent[None]]), _last_axis(u))
     tangent = tangent / jnp.linalg.norm(tangent)
     sound = (size <= _small(u)) & (first | (tangent @ walk.tangent > _LEAST_COSINE))
     longer = jnp.minimum(jnp.where(count <= _FEW_CORRECTIONS, 2 * length, length), longest)
-    longer = jnp.where(first, longest, longer)
     points, corrections = walk.points.at[walk.found].set(u), walk.corrections.at[walk.found].set(count)
     new = _Walk(u, tangent, longer, jnp.zeros_like(walk.cuts), points, walk.found + 1, corrections, over | (~first & (u[-1] <= 0)))
     cut = walk._replace(length=length / 2, cuts=walk.cuts + 1)
@@ -192,11 +190,15 @@ def _aim(walk: _Walk, first: Array) -> tuple[Array, Array, Array, Array]:
 
     The first point and the end of the path lie in planes of fixed s.
     """
-    along = jnp.zeros_like(walk.u).at[-1].set(1.0)
     over = ~first & (walk.u[-1] + walk.length * walk.tangent[-1] >= 1)
     length = jnp.where(over, (1 - walk.u[-1]) / jnp.where(over, walk.tangent[-1], 1.0), walk.length)
     goal = jnp.where(first, walk.u, walk.u + length * walk.tangent)
-    return goal, jnp.where(first | over, along, walk.tangent), length, over
+    return goal, jnp.where(first | over, _last_axis(walk.u), walk.tangent), length, over
+
+
+def _last_axis(u: Array) -> Array:
+    """Unit vector of the parameter's axis."""
+    return jnp.zeros_like(u).at[-1].set(1.0)
 
 
 def _small(u: Array) -> Array:
@@ -230,7 +232,7 @@ def _equilibrium(system: _System, u: Array, status: Array, steps: Array) -> Equi
 
     y = lax.custom_root(lambda y: system.residual(jnp.append(y, s)), u[:-1], lambda _, guess: guess, solved)
     scene, inputs = _at(system.scene, system.path, s)
-    _, kind = system.problem(s)
-    unknown = system.unknown(jnp.append(y, s))
-    forces = with_tensions(scene.forces(inputs), unknown.tension, kind)
+    problem, kind = system.problem(s)
+    unknown = system.unknown(jnp.append(y, s), problem, kind)
+    forces = with_tensions(problem.forces, unknown.tension, kind)
     return Equilibrium(scene, inputs, system.model, Outcome(unknown._replace(tension=()), forces, status, steps))

@@ -10,7 +10,7 @@ from jax.custom_batching import custom_vmap
 from jaxtyping import Array
 
 from . import component as c
-from .balance import chosen, no_derivative, rounding_floor, solve_balance, spread, strain_norm
+from .balance import chosen, no_derivative, rounding_floor, solve_balance, spread, strain_norm, with_locked
 from .component import Vector
 from .coupled import Imbalance, Kind, Problem, State, Unknown, harmless, imbalance_of, size_of_loads, state_of, with_tensions
 from .coupled_tangent import approximate_solve, tangent_solve
@@ -44,8 +44,7 @@ def _solve_arm_jvp(kind: Kind, primals: tuple[Problem], tangents: tuple[Problem]
         """Unknowns at the solution plus a change of those that are solved for; locked strains are those of the rod at rest."""
         rest = problem.sections.rest
         xi = tuple(jnp.where(sound, x, jnp.broadcast_to(r, x.shape)) for x, r in zip(solution.unknown.xi, rest, strict=True))
-        xi = c.add(xi, spread(change.wrench, kind.free))
-        xi = tuple(x if i in kind.free else jnp.broadcast_to(rest[i], x.shape) for i, x in enumerate(xi))
+        xi = with_locked(c.add(xi, spread(change.wrench, kind.free)), rest, kind.free)
         others = (tuple(jnp.where(sound, x, 0.0) for x in part) for part in solution.unknown[1:])
         tension, turning = (c.add(x, dx) for x, dx in zip(others, change[1:], strict=True))
         return Unknown(xi, tension, turning)
@@ -63,8 +62,7 @@ def _solve_arm_jvp(kind: Kind, primals: tuple[Problem], tangents: tuple[Problem]
     # the rods' own rest strain moves the locked strains
     _, locked = jax.jvp(lambda problem: placed(still, problem).xi, primals, tangents)
     moved = spread(c.scale(-1.0, change.wrench), kind.free)
-    xi = tuple(x if i in kind.free else y for i, (x, y) in enumerate(zip(moved, locked, strict=True)))
-    d_unknown = Unknown(xi, c.scale(-1.0, change.cable), c.scale(-1.0, change.turning))
+    d_unknown = Unknown(with_locked(moved, locked, kind.free), c.scale(-1.0, change.cable), c.scale(-1.0, change.turning))
     return solution, Solution(d_unknown, *no_derivative(*solution[1:]))
 
 

@@ -79,12 +79,9 @@ def eliminate(
         return spread(x, free), ~jnp.any(jnp.isnan(x[-1]), axis=(0, 1))
     flat = jax.tree.map(_flat, (lower, right, xi, along.wrench, along.rotation))
     lower, right, xi, wrench, rotation = c.keep(flat, flat[1][0])
-    density = jax.tree.map(_flat, loads.follower_density)
-    cells, linear, local = _cells(lower, right, xi, wrench, rotation, density, _flat(grid.weight), free)
-    if loads.follows:
-        cells = cells._replace(jump=jax.tree.map(_flat, _jumps(along, loads, grid)))
-    else:
-        cells = cells._replace(by_push=None, stretch=None, axis=None)
+    loads = loads._replace(follower_density=jax.tree.map(_flat, loads.follower_density))
+    cells, linear, local = _cells(lower, right, xi, wrench, rotation, loads, _flat(grid.weight), free)
+    cells = cells._replace(jump=jax.tree.map(_flat, _jumps(along, loads, grid)))
     zero = jnp.zeros_like(right[0][0])
     nothing = (zero, zero, zero)
     size = 6 if loads.follows else 3
@@ -114,10 +111,10 @@ def _unflat(x: Array, grid: Grid) -> Array:
 
 
 def _cells(
-    lower: Matrix, right: Vector, xi: Vector, wrench: Vector, rotation: Matrix, density: Vector | None, w: Array, free: tuple[int, ...]
+    lower: Matrix, right: Vector, xi: Vector, wrench: Vector, rotation: Matrix, loads: Loading, w: Array, free: tuple[int, ...]
 ) -> tuple[Cell, Linear, Array]:
-    """All that does not depend on P, for all nodes at once, and whether nothing is unstable yet; `density`: of follower loads."""
-    half = 0.5 * w
+    """All that does not depend on P, for all nodes at once, and whether nothing is unstable yet."""
+    half, density = 0.5 * w, loads.follower_density
     m, n, u = c.skew(wrench[:3]), c.skew(wrench[3:]), c.skew(xi[3:])
     moment, by_force, force = c.matmul(n, u), n, None  # changes with the rotation, less what P adds
     if density is not None:
@@ -148,11 +145,10 @@ def _cells(
         c.add(c.scale(2.0, moment), c.matmul(lever, moved)),
         c.subtract(c.scale(w, moment), c.matmul(lever, by_bend)),
         c.matvec(lever, pushed),
-        c.scale(-1.0, c.matmul(compliance, D)),
-        c.matmul(lever, flexibility),
-        xi[3:],
-        force,
     )
+    if loads.follows:
+        by_push, stretch = c.scale(-1.0, c.matmul(compliance, D)), c.matmul(lever, flexibility)
+        cell = cell._replace(by_push=by_push, stretch=stretch, axis=xi[3:], force=force)
     return cell, Linear(flexibility, by_force, right[3:], by_bend), rigid & stable
 
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from . import component as c
-from .balance import actuation_wrench, chosen, chosen_rows, residual, spread, tangent
+from .balance import actuation_wrench, chosen, chosen_rows, residual, spread, tangent, with_locked
 from .component import Vector
 from .quadrature import Grid, beyond, locate, within
 from .routing import thread_tangent
@@ -63,7 +63,7 @@ def strain_rate(
     right = right if reaction_rate is None else c.add(right, reaction_rate)
     factor = c.cholesky(chosen_rows(tangent(xi, sections, tau), free))
     answer = spread(c.cholesky_solve(factor, chosen(right, free)), free)
-    return tuple(x if i in free else rate.rest[i] for i, x in enumerate(answer))
+    return with_locked(answer, rate.rest, free)
 
 
 def turning_rate(xi: Vector, xi_rate: Vector, sections: CrossSections, rate: CrossSections, place: int) -> Array:

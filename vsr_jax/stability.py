@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from . import component as c
-from .balance import chosen, chosen_rows, residual, tangent, thread_direction, thread_wrench
+from .balance import chosen, chosen_rows, residual, spread, tangent, thread_direction, thread_wrench, with_locked
 from .component import Vector
 from .model import Nodes
 from .reaction import loading, react
@@ -33,7 +33,7 @@ def _whole(scene: Scene, forces: Vector, nodes: Nodes, tau: Vector) -> Array:
     still = jnp.stack(jnp.broadcast_arrays(*chosen(nodes.xi, free)))
 
     def imbalance(values: Array) -> Array:
-        xi = tuple(values[free.index(i)] if i in free else x for i, x in enumerate(nodes.xi))
+        xi = with_locked(spread(tuple(values), free), nodes.xi, free)
         reaction = None if loads is None else react(xi, grid, loads).wrench
         return jnp.stack(chosen(residual(xi, sections, tau, reaction), free))
 
