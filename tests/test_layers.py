@@ -9,10 +9,11 @@ import vsr_jax
 
 FOLDER = pathlib.Path(vsr_jax.__file__).parent
 LAYERS = """
-_types _check component se3 quadrature profile section material routing actuator rod load scene newton balance kinematics cable
-reaction elimination friction coupled coupled_tangent coupled_solve basis model galerkin discrete
-strain_dependent shooting continuum stability equilibrium solve continuation
-scenefile plot paper paper_figures reproduce report timing effects cli
+_types _check component implicit se3 quadrature profile section material routing actuator rod load scene newton balance kinematics
+resolution
+cable reaction elimination friction coupled coupled_tangent coupled_solve basis model galerkin discrete
+strain_dependent shooting continuum stability equilibrium solve health continuation
+scenefile plot paper paper_figures reproduce report timing effects cli_common cli_scene cli_studies cli
 """.split()  # noqa: SIM905
 
 

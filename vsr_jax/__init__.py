@@ -21,6 +21,7 @@ from .discrete import (
     stiffness_matrix as stiffness_matrix,
 )
 from .equilibrium import Equilibrium as Equilibrium
+from .health import Health as Health, check as check
 from .kinematics import step_twist as step_twist, zanna_step as zanna_step
 from .load import (
     DistributedWrench as DistributedWrench,

@@ -16,14 +16,14 @@ with $P = [-\tilde d, 1]$, is symmetric. Symbols, each a tuple of component arra
 """
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 
 from .component import Matrix, Vector, add, cholesky, cholesky_solve, dot, multiply, scale, subtract
+from .implicit import change_of, instantiated, no_derivative
 from .newton import Evaluation, newton
 from .routing import Path, thread_tangent
 from .scene import CrossSections
@@ -104,11 +104,6 @@ def forces_where(sound: Array, tau: Vector) -> Vector:
     return tuple(jnp.where(sound, force, 0.0) for force in tau)
 
 
-def no_derivative(*values: Array) -> tuple[Any, ...]:
-    """Tangents of integer and boolean outputs."""
-    return tuple(np.zeros(value.shape, jax.dtypes.float0) for value in values)
-
-
 def chosen(vector: Vector, free: tuple[int, ...]) -> Vector:
     """Components of the free strains."""
     return tuple(vector[i] for i in free)
@@ -162,7 +157,7 @@ def solve_balance(sections: CrossSections, tau: Vector, reaction: Vector | None 
     return Balance(xi, strain_norm(imbalance, stiffness) <= 16 * floor, definite, steps)
 
 
-@solve_balance.defjvp
+@partial(solve_balance.defjvp, symbolic_zeros=True)
 def _solve_balance_jvp(free: tuple[int, ...], primals: tuple, tangents: tuple) -> tuple[Balance, Balance]:
     sections, tau, reaction = primals
     solution = solve_balance(sections, tau, reaction, free)
@@ -174,7 +169,7 @@ def _solve_balance_jvp(free: tuple[int, ...], primals: tuple, tangents: tuple) -
     def imbalance(sections: CrossSections, tau: Vector, reaction: Vector | None) -> Vector:
         return residual(with_locked(xi, sections.rest, free), sections, forces_where(sound, tau), reaction)
 
-    _, change = jax.jvp(imbalance, primals, tangents)
+    change = change_of(imbalance, primals, tangents)
     factor = cholesky(chosen_rows(tangent(xi, sections, forces_where(sound, tau)), free))
     change = spread(scale(-1.0, cholesky_solve(factor, chosen(change, free))), free)
-    return solution, Balance(with_locked(change, tangents[0].rest, free), *no_derivative(*solution[1:]))
+    return solution, Balance(with_locked(change, instantiated(tangents[0].rest, sections.rest), free), *no_derivative(*solution[1:]))

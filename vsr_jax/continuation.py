@@ -25,7 +25,7 @@ from .coupled import Kind, Problem, Unknown, imbalance_of, problem_of, state_of,
 from .equilibrium import Equilibrium
 from .model import Outcome, Status
 from .scene import Scene
-from .solve import solve
+from .solve import resolved, solve
 from .strain_dependent import StrainDependent
 
 _MOST_CORRECTIONS = 8
@@ -235,4 +235,5 @@ def _equilibrium(system: _System, u: Array, status: Array, steps: Array) -> Equi
     problem, kind = system.problem(s)
     unknown = system.unknown(jnp.append(y, s), problem, kind)
     forces = with_tensions(problem.forces, unknown.tension, kind)
-    return Equilibrium(scene, inputs, system.model, Outcome(unknown._replace(tension=()), forces, status, steps))
+    outcome = resolved(system.model, scene, Outcome(unknown._replace(tension=()), forces, status, steps))
+    return Equilibrium(scene, inputs, system.model, outcome)

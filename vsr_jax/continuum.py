@@ -1,5 +1,6 @@
 r"""The continuous Cosserat model (eq. 12), integrated by diffrax: without loads from the tip, where $F_i(L) = F_a(L)$, to the base."""
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import diffrax
@@ -107,6 +108,9 @@ class Continuum(Model):
         xi = tuple(x.reshape(grid.X.shape) for x in self.strain(scene, forces, state, grid.X.reshape(-1)))
         turning = self.derivative.solve(scene, state.inputs).state.turning if scene.rubbing else ()
         return Nodes(grid, xi, scene.sections(grid.X), shares_at(scene, turning, grid, grid.X))
+
+    def finer(self) -> "Continuum":
+        return replace(self, rtol=0.01 * self.rtol, atol=0.01 * self.atol)
 
     def _control(self, dtype: Any) -> Control:
         finest = 4 * float(jnp.finfo(dtype).eps)

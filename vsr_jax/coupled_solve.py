@@ -10,10 +10,11 @@ from jax.custom_batching import custom_vmap
 from jaxtyping import Array
 
 from . import component as c
-from .balance import chosen, no_derivative, rounding_floor, solve_balance, spread, strain_norm, with_locked
+from .balance import chosen, rounding_floor, solve_balance, spread, strain_norm, with_locked
 from .component import Vector
 from .coupled import Imbalance, Kind, Problem, State, Unknown, harmless, imbalance_of, size_of_loads, state_of, with_tensions
 from .coupled_tangent import approximate_solve, tangent_solve
+from .implicit import change_of, no_derivative
 from .newton import LOAD_SHARES, Damped, Solution, damped_newton
 from .quadrature import Grid
 
@@ -34,7 +35,7 @@ def solve_arm(problem: Problem, kind: Kind) -> Solution:
     return _side_by_side(kind)(_start(problem, kind), problem)
 
 
-@solve_arm.defjvp
+@partial(solve_arm.defjvp, symbolic_zeros=True)
 def _solve_arm_jvp(kind: Kind, primals: tuple[Problem], tangents: tuple[Problem]) -> tuple[Solution, Solution]:
     solution = solve_arm(primals[0], kind)
     # Where nothing was found there is no derivative: take it at rest without loads and forces, where it is finite.
@@ -55,12 +56,12 @@ def _solve_arm_jvp(kind: Kind, primals: tuple[Problem], tangents: tuple[Problem]
 
     free, others = chosen(solution.unknown.xi, kind.free), solution.unknown[1:]
     still = jax.tree.map(jnp.zeros_like, Imbalance(free, *others))
-    _, right = jax.jvp(lambda problem: imbalance(still, problem), primals, tangents)
+    right = change_of(lambda problem: imbalance(still, problem), primals, tangents)
     change = tangent_solve(
         lambda change: imbalance(change, primals[0]), placed(still, primals[0]), harmless(primals[0], sound), right, kind
     )
     # the rods' own rest strain moves the locked strains
-    _, locked = jax.jvp(lambda problem: placed(still, problem).xi, primals, tangents)
+    locked = change_of(lambda problem: placed(still, problem).xi, primals, tangents)
     moved = spread(c.scale(-1.0, change.wrench), kind.free)
     d_unknown = Unknown(with_locked(moved, locked, kind.free), c.scale(-1.0, change.cable), c.scale(-1.0, change.turning))
     return solution, Solution(d_unknown, *no_derivative(*solution[1:]))

@@ -13,8 +13,11 @@ from .component import Vector
 from .coupled import Imbalance, Kind, Problem, State, Unknown, state_of
 from .elimination import eliminate
 
-_REFINEMENTS = 30
+_REFINEMENTS = 60
 """Bound on how often a tangent system is refined; it takes five to ten."""
+
+_KEPT = 3
+"""How many directions are kept for the next to be conjugate to."""
 
 
 def approximate_solve(
@@ -67,7 +70,7 @@ def _tensions(unknown: Unknown, at: State, right: Imbalance, problem: Problem, k
 
 
 def tangent_solve(imbalance: Callable, unknown: Unknown, problem: Problem, right: Imbalance, kind: Kind) -> Imbalance:
-    """Solution of the exact tangent system: what `approximate_solve` leaves is solved for again, until nothing is left."""
+    """Solution of the exact tangent system, with `approximate_solve` as preconditioner; NaN where it is not found."""
     # custom_linear_solve has a transpose only if all of its right side is linear in the tangents; rows that nothing moves are not
     tie = 0.0 * sum((jnp.sum(x) for x in jax.tree.leaves(right)), jnp.zeros_like(right.wrench[0][0, 0]))
     right = jax.tree.map(lambda x: x + tie, right)
@@ -80,26 +83,64 @@ def tangent_solve(imbalance: Callable, unknown: Unknown, problem: Problem, right
         step = jax.tree.map(lambda x: x.astype(problem.grid.h.dtype), step)
         return Imbalance(chosen(step.xi, kind.free), step.tension, step.turning)
 
-    def refine(apply: Callable, precondition: Callable, b: Imbalance) -> Imbalance:
-        least = 4 * jnp.finfo(problem.grid.h.dtype).eps
+    # what does not depend on the right side is done once, before the loop
+    _, nearly = jax.linearize(nearly, still)
+    back = jax.linear_transpose(nearly, still)
+    weight = _weights(problem, kind)
 
-        def proceed(carry: tuple) -> Array:
-            _, correction, whole, count = carry
-            return (count < _REFINEMENTS) & (correction > least * whole)
+    def solve(apply: Callable, b: Imbalance) -> Imbalance:
+        return _refined(apply, nearly, b, weight)
 
-        def advance(carry: tuple) -> tuple:
-            x, _, _, count = carry
-            step = precondition(c.subtract(b, apply(x)))
-            x = c.add(x, step)
-            return x, _largest(step), _largest(x), count + 1
+    def transpose_solve(apply: Callable, b: Imbalance) -> Imbalance:
+        return _refined(apply, lambda r: back(r)[0], b, weight)
 
-        size = jnp.zeros_like(_largest(b))
-        return lax.while_loop(proceed, advance, (still, size + jnp.inf, size, 0))[0]
+    return lax.custom_linear_solve(matvec, right, solve, transpose_solve)
 
-    def transposed(b: Imbalance) -> Imbalance:
-        return jax.vjp(nearly, still)[1](b)[0]
 
-    return lax.custom_linear_solve(matvec, right, lambda apply, b: refine(apply, nearly, b), lambda apply, b: refine(apply, transposed, b))
+def _weights(problem: Problem, kind: Kind) -> Imbalance:
+    """Weights that make the squares of wrenches, forces and turning rates comparable: as strains without unit."""
+    stiffness = problem.sections.stiffness
+    axial = jnp.mean(stiffness[3])
+    wrench = tuple(1 / (axial * s) for s in chosen(stiffness, kind.free))
+    return Imbalance(wrench, (axial**-2,) * len(kind.cables), (jnp.mean(stiffness[1]) / axial,) * len(kind.rubbing))
+
+
+def _refined(apply: Callable, nearly: Callable, right: Imbalance, weight: Imbalance) -> Imbalance:
+    """Solution by generalised conjugate residuals with a solver that is nearly right, each new residual normal to the last few.
+
+    Where an arm is soft the approximate tangent may be ten times too stiff for one of its motions. Refining by the residual
+    alone would then take hundreds of steps; the few directions kept find such a motion at once.
+    """
+    least = 4 * jnp.finfo(right.wrench[0].dtype).eps
+
+    def dot(a: Imbalance, b: Imbalance) -> Array:
+        return sum(jax.tree.leaves(jax.tree.map(lambda w, x, y: jnp.sum(w * x * y), weight, a, b)), jnp.zeros_like(zero))
+
+    def proceed(carry: tuple) -> Array:
+        *_, correction, whole, count = carry
+        return (count < _REFINEMENTS) & (correction > least * whole)
+
+    def advance(carry: tuple) -> tuple:
+        x, r, kept, _, _, count = carry
+        p = nearly(r)
+        q = apply(p)
+        for old_p, old_q in kept:
+            share = dot(q, old_q)
+            p, q = c.subtract(p, c.scale(share, old_p)), c.subtract(q, c.scale(share, old_q))
+        size = dot(q, q)
+        inverse = jnp.where(size > 0, 1 / jnp.sqrt(jnp.where(size > 0, size, 1.0)), 0.0)
+        p, q = c.scale(inverse, p), c.scale(inverse, q)
+        part = dot(r, q)
+        step = c.scale(part, p)
+        x, r = c.add(x, step), c.subtract(r, c.scale(part, q))
+        return x, r, (*kept[1:], (p, q)), _largest(step), _largest(x), count + 1
+
+    still = jax.tree.map(jnp.zeros_like, right)
+    zero = jnp.zeros_like(_largest(right))
+    start = still, right, ((still, still),) * _KEPT, zero + jnp.inf, zero, 0
+    x, *_, correction, whole, _ = lax.while_loop(proceed, advance, start)
+    found = correction <= least**0.5 * whole  # no derivative rather than a wrong one
+    return jax.tree.map(lambda leaf: jnp.where(found, leaf, jnp.nan), x)
 
 
 def _largest(tree: Imbalance) -> Array:

@@ -1,5 +1,6 @@
 r"""The model with a prescribed basis (eq. 14-18): $K q = B(q) \tau$ by Gauss quadrature and Newton's method."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -10,11 +11,12 @@ from jaxtyping import Array, Float
 from . import component as c, galerkin
 from ._check import choice, count, instance
 from ._types import Scalar
-from .balance import forces_where, no_derivative, residual, rounding_floor, tangent, thread_direction, thread_wrench
+from .balance import forces_where, residual, rounding_floor, tangent, thread_direction, thread_wrench
 from .basis import AbstractBasis
 from .component import Vector
 from .coupled import problem_of, with_tensions
 from .galerkin import solve_prescribed
+from .implicit import change_of, no_derivative
 from .kinematics import ORDERS, accumulate_jacobian
 from .model import Nodes, Outcome, Status, SteppedModel, classify
 from .newton import Evaluation, newton
@@ -90,7 +92,7 @@ def solve_projected(projection: Projection, tau: Vector) -> tuple[Float[Array, "
     return q, norm(imbalance(q)) <= 16 * floor, definite, steps
 
 
-@solve_projected.defjvp
+@partial(solve_projected.defjvp, symbolic_zeros=True)
 def _solve_projected_jvp(primals: tuple, tangents: tuple) -> tuple:
     projection, tau = primals
     q, balanced, definite, steps = solve_projected(projection, tau)
@@ -100,7 +102,7 @@ def _solve_projected_jvp(primals: tuple, tangents: tuple) -> tuple:
     def imbalance(projection: Projection, tau: Vector) -> Array:
         return projection.integrate(residual(projection.strain(q_sound), projection.sections, forces_where(sound, tau)))
 
-    _, change = jax.jvp(imbalance, primals, tangents)
+    change = change_of(imbalance, primals, tangents)
     H = projection.stiffness(tangent(projection.strain(q_sound), projection.sections, forces_where(sound, tau)))
     return (q, balanced, definite, steps), (-_solve(H, change), *no_derivative(balanced, definite, steps))
 

@@ -15,7 +15,7 @@ from .component import Vector
 from .model import Model, Nodes, Outcome, Status
 from .reaction import loading, react_at
 from .scene import Scene
-from .stability import margin
+from .stability import extremes
 
 
 class Equilibrium(eqx.Module):
@@ -84,7 +84,14 @@ class Equilibrium(eqx.Module):
         margin below 0 does not prove instability.
         """
         self._refuse_batch()
-        return self._stability()
+        return self._mask(self._extremes()[0])
+
+    @property
+    def condition(self) -> Scalar:
+        """Condition number of the scaled tangent stiffness of `stability`, greatest by least eigenvalue: it magnifies rounding."""
+        self._refuse_batch()
+        least, greatest = self._extremes()
+        return self._mask(greatest / jnp.abs(least))
 
     @property
     def lengths(self) -> Float[Array, " threads"]:
@@ -182,8 +189,8 @@ class Equilibrium(eqx.Module):
         return self._mask(slack)
 
     @eqx.filter_jit
-    def _stability(self) -> Scalar:
-        return self._mask(margin(self.scene, self._sound_forces, self._nodes()))
+    def _extremes(self) -> tuple[Scalar, Scalar]:
+        return extremes(self.scene, self._sound_forces, self._nodes())
 
     @eqx.filter_jit
     def _reaction(self, X: Array) -> Array:

@@ -13,11 +13,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from . import component as c
-from .balance import no_derivative, residual, rounding_floor
+from .balance import residual, rounding_floor
 from .cable import path_length
 from .component import Vector
 from .coupled import Kind, Problem, harmless, size_of_loads, with_tensions
 from .friction import rubbed, turning_rate
+from .implicit import change_of, no_derivative
 from .newton import LOAD_SHARES, Damped, Solution, damped_newton
 from .reaction import react
 from .scene import shared
@@ -111,7 +112,7 @@ def _jacobian(unknown: Unknown, basis: Basis, problem: Problem, kind: Kind) -> A
     return jax.jacfwd(flat)(jnp.concatenate(unknown))
 
 
-@solve_prescribed.defjvp
+@partial(solve_prescribed.defjvp, symbolic_zeros=True)
 def _solve_prescribed_jvp(kind: Kind, primals: tuple, tangents: tuple) -> tuple[Solution, Solution]:
     solution = solve_prescribed(*primals, kind)
     sound = solution.balanced & solution.definite
@@ -120,7 +121,7 @@ def _solve_prescribed_jvp(kind: Kind, primals: tuple, tangents: tuple) -> tuple[
     def residual_of(basis: Basis, problem: Problem) -> Array:
         return jnp.concatenate(imbalance(unknown, basis, harmless(problem, sound), kind))
 
-    _, change = jax.jvp(residual_of, primals, tangents)
+    change = change_of(residual_of, primals, tangents)
     J = _jacobian(unknown, primals[0], harmless(primals[1], sound), kind)
     flat, size = -jnp.linalg.solve(J, change), unknown.q.size
     return solution, Solution(Unknown(flat[:size], flat[size:]), *no_derivative(*solution[1:]))

@@ -1,6 +1,7 @@
 """What every model of a scene offers, and what those that advance by Magnus steps share."""
 
 from abc import abstractmethod
+from dataclasses import replace
 from enum import IntEnum
 from typing import Any, NamedTuple
 
@@ -9,11 +10,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ._types import Pose
+from ._types import Pose, Scalar
+from .balance import thread_direction, thread_wrench
 from .component import Vector, dot
 from .kinematics import step_components, step_poses, tip_pose
 from .quadrature import Grid, gauss_legendre, locate, make_grid
-from .routing import thread_tangent
+from .resolution import step_error
+from .routing import Path, thread_tangent
 from .scene import CrossSections, Scene, shared
 from .se3 import exp_components, pose
 
@@ -27,6 +30,7 @@ class Status(IntEnum):
     COLLAPSED = 3
     NOT_FINITE = 4
     INADMISSIBLE = 5
+    UNDER_RESOLVED = 6
 
     @property
     def message(self) -> str:
@@ -41,6 +45,7 @@ _MESSAGES = {
     Status.COLLAPSED: "collapsed: a thread has shortened its own path, or the arm, to nothing",
     Status.NOT_FINITE: "an input or an intermediate value is not finite",
     Status.INADMISSIBLE: "an input lies outside its actuator's range",
+    Status.UNDER_RESOLVED: "under-resolved: the arm bends too fast along its length for so few steps",
 }
 
 
@@ -94,6 +99,14 @@ class Model(eqx.Module):
     def nodes(self, scene: Scene, forces: Vector, state: Any) -> Nodes:
         """What quantities along the arm are summed from."""
 
+    @abstractmethod
+    def finer(self) -> "Model":
+        """The same model with twice the steps, or with tighter tolerances where they are chosen by those."""
+
+    def step_error(self, scene: Scene, forces: Vector, state: Any) -> Scalar | None:
+        """Rough estimate of the tip's error by the steps, as a share of the arm's length; None for steps that adapt themselves."""
+        return None
+
 
 class SteppedModel(Model):
     """A model whose pose advances by Magnus steps on the strain at their Gauss points."""
@@ -111,6 +124,13 @@ class SteppedModel(Model):
 
     def tip(self, scene: Scene, forces: Vector, state: Any) -> Pose:
         return tip_pose(self.node_strain(scene, state), self.grid(scene).h, scene.rod.base)
+
+    def finer(self) -> "SteppedModel":
+        return replace(self, steps=2 * self.steps)
+
+    def step_error(self, scene: Scene, forces: Vector, state: Any) -> Scalar:
+        nodes = self.nodes(scene, forces, state)
+        return step_error(nodes.xi, nodes.sections, forces, nodes.grid)
 
     @abstractmethod
     def node_strain(self, scene: Scene, state: Any) -> Vector:
@@ -132,9 +152,14 @@ def classify(xi: Vector, sections: CrossSections, tau: Vector, balanced: Array, 
     """`Status` from the strain, whether it balances and whether the tangent is positive definite, over all nodes.
 
     With tendons alone (not `loaded`) the energy is convex, so a node that cannot be balanced has its least energy at a kink,
-    where the path of a thread has no length left: it has collapsed. So has a node where a path, or the axis, has turned over.
+    where the path of a thread has no length left: it has collapsed. So has a node where a path, or the axis, has turned over,
+    and under loads, where it cannot be balanced, one with a thread that alone would shorten its path to nothing.
     """
-    pulling = jnp.all(jnp.stack([jnp.all(force <= 0) for force in tau])) if tau and not loaded else jnp.array(False)
+    pulling = jnp.array(False)
+    if tau and loaded:
+        pulling = jnp.any(jnp.stack([_exhausted(force, path, sections) for force, path in zip(tau, sections.paths, strict=True)]))
+    elif tau:
+        pulling = jnp.all(jnp.stack([jnp.all(force <= 0) for force in tau]))
     left = xi[3] / sections.rest[3]
     for path, reach in zip(sections.paths, sections.reach, strict=True):
         rest = thread_tangent(sections.rest, path)
@@ -147,6 +172,13 @@ def classify(xi: Vector, sections: CrossSections, tau: Vector, balanced: Array, 
     status = jnp.where(lost & jnp.all(balanced) if loaded else lost, Status.UNSTABLE, status)
     status = jnp.where(collapsed, Status.COLLAPSED, status)
     return jnp.where(finite, status, Status.NOT_FINITE).astype(jnp.int32)
+
+
+def _exhausted(force: Array, path: Path, sections: CrossSections) -> Array:
+    r"""Whether a tendon alone would use up its path at the rate by which it shortens at rest: $T w^T \Sigma^{-1} w \ge |t_c|$."""
+    t, length = thread_direction(sections.rest, path)
+    w = thread_wrench(t, path)
+    return jnp.any(-force * dot(w, tuple(x / s for x, s in zip(w, sections.stiffness, strict=True))) >= length)
 
 
 def rest_where_failed(status: Array, xi: Vector, sections: CrossSections) -> Vector:

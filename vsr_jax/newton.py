@@ -16,6 +16,7 @@ LOAD_SHARES = 5
 _LEAST_FRACTION = 1e-6
 _LEAST_DAMPING, _MOST_DAMPING = 0.1, 1e8
 _RAISE, _LOWER = 10.0, 30.0
+_LEAST_LEFT, _MOST_LEFT = 0.25, 0.99
 
 
 class Evaluation(NamedTuple):
@@ -100,7 +101,9 @@ def damped_newton(
     than it pulled, $r(x + s) \cdot s \le -r(x) \cdot s$, so that the energy falls, or if the residual has become smaller.
     The loads come in equal shares, one more with every step taken until all are there, and such a step is always taken:
     what matters of the way is only where it leads. All at once they often make the tangent indefinite at the start.
-    The tangent may be approximate: the end is reached when an undamped step is negligible, without taking it, so that the
+    The tangent may be approximate. Where it is much too stiff for a soft motion of the arm, what is left of the residual along
+    a full step is a share $\rho$ near 1, and the steps would shrink by it alone: so the next takes $\rho^2 / (1 - \rho)$ of the last
+    step with it, the rest of the geometric series. The end is reached when an undamped step is negligible, without taking it, so that the
     residual returned is that of the point returned. Problems may stand side by side, in the last axes of all arrays: each
     goes its own way and stands still when it is done.
 
@@ -125,9 +128,12 @@ def damped_newton(
         damping = jnp.where(old.fresh, _lowered(old.damping), old.damping)
         given = jnp.where(old.fresh, jnp.minimum(old.given + 1, shares), old.given)
         new = evaluate(trial, damping, given / shares)
-        better = (old.given < shares) | (work(new.residual, step) >= -old.pull) | (new.merit < old.merit) | (new.merit < floor)
+        left = work(new.residual, step)
+        better = (old.given < shares) | (left >= -old.pull) | (new.merit < old.merit) | (new.merit < floor)
         taken = ~old.fresh | (jnp.isfinite(new.merit) & better)
         damping = jnp.where(taken & new.definite, damping, _raised(jnp.where(taken, damping, old.damping)))
+        more = jnp.where((old.damping == 0) & (damping == 0) & old.fresh & (old.given == shares), _extrapolated(left / old.pull), 0.0)
+        new = new._replace(step=jax.tree.map(lambda s, last: s + more.astype(s.dtype) * last, new.step, step))
         there = _Guard(new.size, new.merit, new.definite, work(new.residual, new.step), damping, given, new.definite, old.spent)
         here = old._replace(damping=damping, fresh=jnp.zeros_like(taken))
         guard = _where(taken, there, here)._replace(spent=old.spent + 1)
@@ -156,6 +162,12 @@ class _Guard(NamedTuple):
     given: Array
     fresh: Array
     spent: Array
+
+
+def _extrapolated(left: Array) -> Array:
+    """How much of the last step to take again, from the share of the residual that it left along itself."""
+    share = jnp.clip(left, 0.0, _MOST_LEFT)
+    return jnp.where(share > _LEAST_LEFT, share**2 / (1 - share), 0.0)
 
 
 def _raised(damping: Array) -> Array:

@@ -1,4 +1,4 @@
-"""A solved scene for people and for programs: lines of text, and a record that goes into JSON."""
+"""A solved scene, and the health of a solve, for people and for programs: lines of text, and records that go into JSON."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 
 from .equilibrium import Equilibrium
+from .health import MOST_FACTOR, Health, Limit
+from .model import Status
 from .plot import Samples
 
 
@@ -49,6 +51,85 @@ def record(eq: Equilibrium, samples: Samples | None) -> dict[str, Any]:
         "steps": int(eq.steps),
         **solved,
     }
+
+
+def health_lines(health: Health, title: str = "") -> list[str]:
+    """The health of a solve in a few lines, the last of them advice."""
+    eq, length = health.equilibrium, float(health.equilibrium.scene.rod.length)
+    text = lines(eq, title)[: 3 if title else 2]
+    if bool(eq.converged):
+        digits = -np.log10(float(np.finfo(eq.inputs.dtype).eps) * float(eq.condition))
+        text.append(f"  margin       {float(eq.stability):.4g} (1 without forces, 0 where the equilibrium ceases to be stable)")
+        text.append(f"  condition    {float(eq.condition):.3g}: some {max(0, int(digits))} digits of the strains are sure")
+        moved = float(health.tip_change)
+        told = f"move the tip by {moved:.2g} m, {moved / length:.1g} of the length" if np.isfinite(moved) else "do not converge"
+        text.append(f"  resolution   finer steps {told}")
+    text += [f"  {name:12} {_reach(limit)}" for name, limit in (("inputs", health.inputs), ("loads", health.loads)) if limit is not None]
+    if health.independence is not None:
+        text.append(f"  independence {float(health.independence):.2g} of the threads (0: some do together what others do, 1: each its own)")
+    return text + [f"  advice       {sentence}" for sentence in _advice(health)]
+
+
+def health_record(health: Health) -> dict[str, Any]:
+    """The health of a solve as numbers and texts, with None for what is not known.
+
+    **Returns:** `status` in words, `converged`, `margin`, `condition`, `independence`; `inputs` and `loads`, each with the
+    `factor` by which it may grow and what ends it, `then`; `tip_change` [m] by finer steps; `advice`, a list of sentences.
+    """
+    eq = health.equilibrium
+
+    def known(value: Any) -> float | None:
+        return None if value is None or not np.isfinite(value) else float(value)
+
+    def limit(found: Limit | None) -> dict[str, Any] | None:
+        return None if found is None else {"factor": float(found.factor), "then": Status(int(found.status)).message}
+
+    return {
+        "status": eq.message,
+        "converged": bool(eq.converged),
+        "margin": known(eq.stability),
+        "condition": known(eq.condition),
+        "independence": known(health.independence),
+        "inputs": limit(health.inputs),
+        "loads": limit(health.loads),
+        "tip_change": known(health.tip_change),
+        "advice": _advice(health),
+    }
+
+
+def _reach(limit: Limit) -> str:
+    if int(limit.status) == Status.CONVERGED:
+        return f"may grow together to {MOST_FACTOR:g} times and more"
+    return f"may grow together to {float(limit.factor):.4g} times; then {Status(int(limit.status)).message}"
+
+
+def _advice(health: Health) -> list[str]:
+    """What to do, worst first; that all is well if there is nothing."""
+    eq, length = health.equilibrium, float(health.equilibrium.scene.rod.length)
+    if not bool(eq.converged):
+        return [_REMEDIES[Status(int(eq.status))].format(eq.model.finer())]
+    near = [
+        f"little is missing to where it fails: {name} may grow by {100 * (float(limit.factor) - 1):.2g} %"
+        for name, limit in (("inputs", health.inputs), ("loads", health.loads))
+        if limit is not None and 1 <= limit.factor < 1.25
+    ]
+    advice = near + ["the equilibrium is nearly unstable: small errors of the model move it far"] * (float(eq.stability) < 0.1)
+    if not float(health.tip_change) < 1e-3 * length:
+        advice.append(f"take more steps: {eq.model.finer()!r}")
+    if health.independence is not None and health.independence < 1e-9:
+        advice.append("threads do what others do: no shape tells all their forces (the solve is not harmed)")
+    return advice or ["all is well"]
+
+
+_REMEDIES = {
+    Status.MAX_STEPS: "go there by degrees with vsr.trace, or look whether loads and inputs are in SI units",
+    Status.UNSTABLE: "the arm would jump: follow the branch with vsr.trace, or lower what drives it to the factor above",
+    Status.COLLAPSED: "lower the tensions to the factor above, or stiffen the rod: its axial stiffness bounds what tendons may pull",
+    Status.NOT_FINITE: "look for NaN and infinities in the scene and the inputs",
+    Status.INADMISSIBLE: "tensions and pressures may not be negative; use a Thread where the force may have either sign",
+    Status.UNDER_RESOLVED: "take more steps: {!r}, or more still",
+}
+"""What to do about a solve that failed."""
 
 
 def _threads(eq: Equilibrium) -> list[str]:

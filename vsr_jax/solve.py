@@ -10,6 +10,7 @@ from ._check import instance, is_traced
 from ._types import cast
 from .equilibrium import Equilibrium
 from .model import Model, Outcome, Status
+from .resolution import COARSE
 from .scene import Scene
 from .strain_dependent import StrainDependent
 
@@ -49,9 +50,18 @@ def solve(scene: Scene, inputs: Any, *, model: Model | None = None, throw: bool 
 @eqx.filter_jit
 def _solve(scene: Scene, inputs: Float[Array, " inputs"], model: Model) -> Outcome:
     finite, admitted = jnp.all(jnp.isfinite(inputs)), scene.admits(inputs)
-    state, forces, status, steps = model.solve(scene, jnp.where(finite & admitted, inputs, 0.0))
-    status = jnp.where(admitted, status, Status.INADMISSIBLE)
-    return Outcome(state, forces, jnp.where(finite, status, Status.NOT_FINITE).astype(jnp.int32), steps)
+    outcome = resolved(model, scene, model.solve(scene, jnp.where(finite & admitted, inputs, 0.0)))
+    status = jnp.where(admitted, outcome.status, Status.INADMISSIBLE)
+    return outcome._replace(status=jnp.where(finite, status, Status.NOT_FINITE).astype(jnp.int32))
+
+
+def resolved(model: Model, scene: Scene, outcome: Outcome) -> Outcome:
+    """The outcome, with the status under-resolved where it had converged on steps that are too few for its shape."""
+    error = model.step_error(scene, outcome.forces, outcome.state)
+    if error is None:
+        return outcome
+    coarse = (outcome.status == Status.CONVERGED) & (error > COARSE)
+    return outcome._replace(status=jnp.where(coarse, Status.UNDER_RESOLVED, outcome.status).astype(jnp.int32))
 
 
 def _raise_if_failed(equilibrium: Equilibrium) -> Equilibrium:

@@ -1,4 +1,4 @@
-r"""The margin of stability: the least eigenvalue of the tangent stiffness, scaled so that an arm without forces has 1."""
+r"""Eigenvalues of the tangent stiffness, scaled so that an arm without forces has 1: the least is the margin of stability."""
 
 import jax
 import jax.numpy as jnp
@@ -12,18 +12,20 @@ from .reaction import loading, react
 from .scene import Scene
 
 
-def margin(scene: Scene, forces: Vector, nodes: Nodes) -> Array:
-    r"""Least eigenvalue of $\Sigma^{-1/2} H \Sigma^{-1/2}$: of each node alone, or of all together where they are coupled.
+def extremes(scene: Scene, forces: Vector, nodes: Nodes) -> tuple[Array, Array]:
+    r"""Least and greatest eigenvalue of $\Sigma^{-1/2} H \Sigma^{-1/2}$: of each node alone, or of all together where they are coupled.
 
-    Coupled, it is that of the symmetric part of the whole tangent, less the changes of strain that the taut cables forbid.
+    Coupled, they are those of the symmetric part of the whole tangent, less the changes of strain that the taut cables forbid.
     """
     tau = nodes.tau(forces)
     if not scene.loads and not scene.length_driven:
         lower = chosen_rows(tangent(nodes.xi, nodes.sections, tau), scene.free)
         root = jnp.sqrt(c.join(chosen(nodes.sections.stiffness, scene.free)))
         scaled = c.join_matrix(c.symmetric(lower)) / (root[..., :, None] * root[..., None, :])
-        return jnp.min(jnp.linalg.eigvalsh(scaled))
-    return jnp.linalg.eigvalsh(_whole(scene, forces, nodes, tau))[0]
+        values = jnp.linalg.eigvalsh(scaled)
+        return jnp.min(values), jnp.max(values)
+    values = jnp.linalg.eigvalsh(_whole(scene, forces, nodes, tau))
+    return values[0], values[-1]
 
 
 def _whole(scene: Scene, forces: Vector, nodes: Nodes, tau: Vector) -> Array:

@@ -1,0 +1,213 @@
+"""Hard arms under loads: a table with what must come out of each, arms of all sizes, and the two-section arm with six tendons.
+
+All arms of the table are one structure, in which everything may jump: two radii, two materials, a thread that ends, and a
+load of each kind, so that one compiled program a precision solves them all. Loads are without unit: forces by $EI / L^2$.
+"""
+
+import math
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import epsilon
+
+import vsr_jax as vsr
+
+MODEL = vsr.StrainDependent(8)
+LENGTH = 0.3
+AXIAL = 1e6 * math.pi * 0.01**2
+BENDING = AXIAL * 0.01**2 / 4
+
+
+def arm(*, weight=0.0, down=(0.0, 0.0, -1.0), dead=(0.0, 0.0, 0.0), follower=(0.0, 0.0, 0.0), middle=(0.0, 0.0, 0.0), jumps=1.0):
+    """A clamped arm with its weight $\\rho g A L^3 / EI$, forces at its tip and a force at 0.25 m; radius and modulus jump by a factor."""
+    force = BENDING / LENGTH**2
+    gravity = weight * force / LENGTH / (1000 * math.pi * 0.01**2)
+    section = vsr.Circular(vsr.Piecewise((0.1,), (0.01, 0.01 * jumps)))
+    rod = vsr.Rod(LENGTH, section, vsr.Material(vsr.Piecewise((0.15,), (1e6, 1e6 * jumps)), poisson=0.45, density=1000.0))
+    loads = [
+        vsr.Gravity(tuple(gravity * x for x in down)),
+        vsr.PointWrench(0.25, force=tuple(force * x for x in middle)),
+        vsr.TipWrench(force=tuple(force * x for x in dead)),
+        vsr.TipWrench(force=tuple(force * x for x in follower), frame="body"),
+    ]
+    return vsr.Scene(rod, [vsr.Thread(vsr.Parallel(0.0, 0.005), end=0.2)], loads)
+
+
+class Case(NamedTuple):
+    """A hard arm: its tension [N], the status that must come out, the tip [1/L] where it is known, and the error of eight steps."""
+
+    scene: vsr.Scene
+    tension: float = 0.0
+    tip: tuple[float, float, float] | None = None
+    status: vsr.Status = vsr.Status.CONVERGED
+    coarse: float = 1e-11
+
+
+SHORT = BENDING / LENGTH**2 / AXIAL
+"""Strain by a force of $EI / L^2$ along the axis."""
+UP = (-1.0, 0.0, 0.0)
+UNSTABLE, COLLAPSED, NOT_FINITE = vsr.Status.UNSTABLE, vsr.Status.COLLAPSED, vsr.Status.NOT_FINITE
+
+TABLE = {
+    "nothing": Case(arm(), 0.0, (1.0, 0.0, 0.0)),
+    "jumps in everything": Case(
+        arm(weight=9.0, dead=(0.0, 1.0, 0.0), follower=(0.0, 0.0, 1.0), middle=(0.0, -2.0, 0.0), jumps=0.7), 2.0, coarse=3e-5
+    ),
+    "hangs down from its clamp": Case(arm(weight=100.0), coarse=2e-4),
+    "falls over and hangs through itself": Case(arm(weight=100.0, down=UP), 0.1, coarse=1e-3),
+    "column below its weight's limit": Case(arm(weight=7.0, down=UP), 0.0, (1 - 3.5 * SHORT, 0.0, 0.0)),
+    "column beyond its weight's limit": Case(arm(weight=8.5, down=UP), status=UNSTABLE),
+    "strut below Euler's load": Case(arm(dead=(-2.3, 0.0, 0.0)), 0.0, (1 - 2.3 * SHORT, 0.0, 0.0)),
+    "strut beyond Euler's load": Case(arm(dead=(-2.7, 0.0, 0.0)), status=UNSTABLE),
+    "strut beyond Euler's load, nudged": Case(arm(dead=(-2.7, 0.0, 0.0)), 0.05, coarse=1e-6),
+    "strut at eight times Euler's load, nudged": Case(arm(dead=(-20.0, 0.0, 0.0)), 0.05, coarse=1e-4),
+    "strut at eight times Euler's load, nudged from the side": Case(arm(dead=(-20.0, 1e-3, 0.0)), 0.05, coarse=1e-4),
+    "falls over sideways": Case(arm(weight=100.0, down=(-1.0, 1e-4, 0.0)), 0.1, coarse=1e-3),
+    "follower beyond its first critical value": Case(arm(follower=(-25.0, 0.0, 0.0)), 0.0, (1 - 25 * SHORT, 0.0, 0.0)),
+    "follower from the side": Case(arm(follower=(0.0, 0.0, 20.0)), coarse=1e-4),
+    "tension of 1e-300": Case(arm(weight=9.0), 1e-300, coarse=1e-5),
+    "tension past collapse": Case(arm(weight=9.0), 1.1 / (1 / AXIAL + 0.005**2 / BENDING), status=COLLAPSED),
+    "tension of 1e300": Case(arm(weight=9.0), 1e300, status=COLLAPSED),
+    "not a number": Case(arm(weight=9.0), math.nan, status=NOT_FINITE),
+}
+
+
+@jax.jit
+def answer(scene, tension, v):
+    """A number made from the tip, and tip [1/L], status and margin, at a change v of tension and weight."""
+    unit = jnp.where(jnp.abs(tension) > 1e-200, 1e-4 * jnp.abs(tension), 1e-4)
+    gravity = scene.loads[0].acceleration
+    changed = eqx.tree_at(lambda scene: scene.loads[0].acceleration, scene, gravity + 1e-3 * v[1])
+    eq = vsr.solve(changed, -(tension + unit * v[0])[None], model=MODEL)
+    tip = eq.tip[:3, 3] / scene.rod.length
+    return tip @ jnp.array([0.3, 0.5, 0.8], tip.dtype), (tip, eq.status, eq.stability)
+
+
+gradient = jax.jit(jax.grad(answer, argnums=2, has_aux=True))
+hessian = jax.jit(jax.hessian(answer, argnums=2, has_aux=True))
+
+
+def at(function, case, dtype, change=(0.0, 0.0)):
+    """What a function of scene, tension and change gives for a case."""
+    with np.errstate(over="ignore"):
+        tension = np.array(case.tension).astype(dtype)
+    return jax.tree.map(np.asarray, function(case.scene.astype(dtype), jnp.asarray(tension), jnp.array(change, dtype)))
+
+
+def differences(function, case):
+    """Derivative of a function by both changes, by central differences of fourth order."""
+
+    def by(i, step):
+        return at(function, case, "float64", np.eye(2)[i] * step)[0]
+
+    return np.stack([(8 * (by(i, 1) - by(i, -1)) - (by(i, 2) - by(i, -2))) / 12 for i in (0, 1)])
+
+
+CONVERGED = [name for name, case in TABLE.items() if case.status == vsr.Status.CONVERGED]
+
+
+@pytest.mark.parametrize("name", TABLE)
+def test_status_and_shape_are_what_they_must_be(name, dtype):
+    case = TABLE[name]
+    _, (tip, status, margin) = at(answer, case, dtype)
+    assert status == (NOT_FINITE if dtype == "float32" and case.tension > 1e38 else case.status)
+    if status != vsr.Status.CONVERGED:
+        assert np.all(np.isnan([*tip, margin]))
+        return
+    assert margin > 0 or "follower" in name or "everything" in name
+    near = 1e-4 if dtype == "float32" else 1e-11
+    if case.tip is not None:
+        np.testing.assert_allclose(tip, case.tip, atol=near)
+    np.testing.assert_allclose(tip, at(answer, case, "float64")[1][0], atol=near)
+
+
+@pytest.mark.parametrize("name", [name for name in CONVERGED if TABLE[name].coarse > 1e-11])
+def test_twice_the_steps_give_the_same_shape(name):
+    case = TABLE[name]
+    np.testing.assert_allclose(at(answer, case, "float64")[1][0], at(finer, case, "float64"), atol=case.coarse)
+
+
+@jax.jit
+def finer(scene, tension, _):
+    return vsr.solve(scene, -tension[None], model=MODEL.finer()).tip[:3, 3] / scene.rod.length
+
+
+@pytest.mark.parametrize("name", CONVERGED)
+def test_gradients_are_those_of_differences(name):
+    case, (found, _) = TABLE[name], at(gradient, TABLE[name], "float64")
+    np.testing.assert_allclose(found, differences(answer, case), atol=3e-6 * np.max(np.abs(found)) + 1e-13)
+
+
+@pytest.mark.slow  # compiling takes minutes
+@pytest.mark.parametrize("name", CONVERGED)
+def test_derivatives_in_both_precisions_are_those_of_differences(name, dtype):
+    case, (found, _), (bend, _) = TABLE[name], at(gradient, TABLE[name], dtype), at(hessian, TABLE[name], dtype)
+    near = 3e-5 if dtype == "float64" else 3e-3
+    slope, curve = differences(answer, case), differences(gradient, case)
+    largest = np.max(np.abs(slope))
+    np.testing.assert_allclose(found, slope, atol=near * largest)
+    np.testing.assert_allclose(bend, curve, atol=near * np.max(np.abs(curve)) + 100 * epsilon(dtype) * largest)
+
+
+def similar_arm(length, young):
+    """An arm that hangs from the horizontal, whose numbers without unit do not depend on its size: weight $\\rho g A L^3 / EI = 9$."""
+    radius = length / 30
+    density = 9 * young * radius**2 / (4 * 9.81 * length**3)
+    rod = vsr.Rod(length, vsr.Circular(radius), vsr.Material(young, poisson=0.45, density=density))
+    return vsr.Scene(rod, [vsr.Tendon(vsr.Parallel(0.7 * radius, 0.0))], [vsr.Gravity()]), 0.01 * young * math.pi * radius**2
+
+
+@jax.jit
+def shape_of(scene, inputs):
+    eq = vsr.solve(scene, inputs, model=MODEL)
+    return eq.tip[:3, 3] / scene.rod.length, eq.stability, eq.status
+
+
+@pytest.mark.parametrize("young", [1e3, 1e6, 2e11])
+@pytest.mark.parametrize("length", [1e-3, 0.3, 10.0])
+def test_arms_of_all_sizes_and_stiffnesses_behave_alike(length, young, dtype):
+    scene, tension = similar_arm(length, young)
+    tip, margin, status = shape_of(scene.astype(dtype), jnp.array([tension], dtype))
+    like, like_tension = similar_arm(1.0, 1.0)
+    expected, expected_margin, _ = shape_of(like.astype("float64"), jnp.array([like_tension]))
+    assert status == vsr.Status.CONVERGED
+    close = 1e-10 if dtype == "float64" else 1e-4
+    np.testing.assert_allclose(tip, expected, atol=close)
+    np.testing.assert_allclose(margin, expected_margin, atol=100 * close)
+
+
+def six_tendon_arm(loads=()):
+    """Two sections of 0.2 m; tendons at 10 mm, at 90, -30 and 210 degrees, three to the middle and three to the end."""
+    rod = vsr.Rod(0.4, vsr.Circular(0.0007), vsr.Material(54e9, poisson=0.3), guide_radius=0.0101)
+    places = [(0.01 * math.cos(angle), 0.01 * math.sin(angle)) for angle in (math.pi / 2, -math.pi / 6, 7 * math.pi / 6)]
+    return vsr.Scene(rod, [vsr.Tendon(vsr.Parallel(*place), end=end) for end in (0.2, None) for place in places], loads)
+
+
+@pytest.fixture(scope="module")
+def draws():
+    random = np.random.default_rng(0)
+    sizes = [(0, 5, 6), (-0.1, 0.1, 3), (-5e-3, 5e-3, 3)]  # tensions [N], tip forces [N] and moments [N m]
+    return [jnp.asarray(random.uniform(low, high, (200, count))) for low, high, count in sizes]
+
+
+def test_six_tendons_pulled_at_random_converge(draws):
+    scene = six_tendon_arm()
+    status, margin = jax.jit(jax.vmap(lambda t: (lambda eq: (eq.status, eq.stability))(vsr.solve(scene, t, model=MODEL))))(draws[0])
+    assert np.all(status == vsr.Status.CONVERGED)
+    assert np.all(margin > 1 - 1e-9)
+
+
+@pytest.mark.slow
+def test_six_tendons_with_random_tip_wrenches_converge(draws):
+    def solved(tensions, force, moment):
+        return vsr.solve(six_tendon_arm([vsr.TipWrench(force=force, moment=moment)]), tensions, model=MODEL)
+
+    eqs = jax.jit(jax.vmap(solved))(*draws)
+    assert np.all(eqs.converged)
+    margin = np.asarray(jax.jit(jax.vmap(lambda eq: eq.stability))(eqs))
+    assert np.all(np.isfinite(margin))
+    assert np.all(margin > 0)

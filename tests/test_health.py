@@ -1,0 +1,102 @@
+"""Health reports: distances to failure that are known in closed form, conditioning, and what is said in words."""
+
+import json
+import math
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vsr_jax as vsr
+from vsr_jax import cli, paper, report
+
+LENGTH, RADIUS = 0.3, 0.01
+AXIAL = 1e6 * math.pi * RADIUS**2
+BENDING = AXIAL * RADIUS**2 / 4
+MODEL = vsr.StrainDependent(4)
+
+
+def rod(density=None):
+    return vsr.Rod(LENGTH, vsr.Circular(RADIUS), vsr.Material(1e6, poisson=0.45, density=density))
+
+
+@pytest.fixture(scope="module")
+def twins():
+    """Two threads in one place."""
+    return vsr.check(vsr.Scene(rod(), [vsr.Tendon(vsr.Parallel(0.0, 0.008))] * 2), jnp.array([1.0, 1.0]), model=MODEL)
+
+
+@pytest.fixture(scope="module")
+def strut():
+    """A strut of half of Euler's load, with a thread on its axis."""
+    load = vsr.TipWrench(force=(-0.5 * math.pi**2 / 4 * BENDING / LENGTH**2, 0.0, 0.0))
+    return vsr.check(vsr.Scene(rod(), [vsr.Tendon(vsr.Parallel(0.0, 0.0))], [load]), jnp.array([0.0]), model=vsr.StrainDependent(16))
+
+
+def test_tensions_may_grow_until_the_path_is_used_up(twins):
+    limit = 1 / (1 / AXIAL + 0.008**2 / BENDING) / 2
+    np.testing.assert_allclose(twins.inputs.factor, limit, rtol=1e-3)
+    assert twins.inputs.status == vsr.Status.COLLAPSED
+    assert twins.loads is None
+
+
+def test_the_papers_arm_collapses_at_93_newtons():
+    health = vsr.check(paper.scene("A1"), jnp.array([-1.0]), model=MODEL)
+    np.testing.assert_allclose(health.inputs.factor, 93.1, rtol=1e-3)
+    assert health.independence is None
+
+
+def test_twin_threads_are_not_independent(twins):
+    assert abs(twins.independence) < 1e-14
+    assert "threads do what others do" in " ".join(report.health_lines(twins))
+    apart = vsr.Scene(rod(), [vsr.Tendon(vsr.Parallel(0.0, 0.008)), vsr.Tendon(vsr.Parallel(0.008, 0.0))])
+    health = vsr.check(apart, jnp.array([1.0, 1.0]), model=MODEL)
+    coupling = (1 / AXIAL) / (1 / AXIAL + 0.008**2 / BENDING)  # of the two, through the elongation alone
+    np.testing.assert_allclose(health.independence, 1 - coupling, rtol=1e-9)
+    assert report.health_lines(health)[-1] == "  advice       all is well"
+
+
+def test_a_strut_may_bear_eulers_load(strut):
+    # the rod shortens and shears before it buckles: the load is Euler's within its own strain
+    np.testing.assert_allclose(strut.loads.factor, 2.0, rtol=5e-3)
+    assert strut.loads.status == vsr.Status.UNSTABLE
+    assert strut.inputs.status == vsr.Status.CONVERGED
+    np.testing.assert_allclose(strut.equilibrium.stability, 0.5, atol=0.01)
+    assert strut.equilibrium.condition > 1 / strut.equilibrium.stability * 0.99
+
+
+def test_no_finer_steps_are_needed_for_an_arc(twins):
+    assert twins.tip_change < 1e-12
+    assert twins.equilibrium.converged
+
+
+def test_it_goes_through_jit(twins):
+    again = eqx.filter_jit(lambda scene, inputs: vsr.check(scene, inputs, model=MODEL))(twins.equilibrium.scene, twins.equilibrium.inputs)
+    np.testing.assert_allclose(again.inputs.factor, twins.inputs.factor)
+
+
+def test_a_failed_solve_gets_a_remedy():
+    helix = vsr.Scene(rod(), [vsr.Tendon(vsr.Helix(0.005, pitch=LENGTH / 50))])
+    health = vsr.check(helix, jnp.array([20.0]), model=vsr.StrainDependent(8))
+    text = report.health_lines(health, "Fifty turns")
+    assert text[0] == "Fifty turns"
+    assert "under-resolved" in text[1]
+    assert "take more steps: StrainDependent(steps=16, order=6)" in text[-1]
+    record = report.health_record(health)
+    assert (record["margin"], record["tip_change"], record["converged"]) == (None, None, False)
+    assert 0 < record["inputs"]["factor"] < 1
+
+
+def test_the_command_prints_and_saves_the_report(tmp_path, capsys):
+    path = tmp_path / "arm.toml"
+    path.write_text(vsr.Scene(rod(), [vsr.Tendon(vsr.Parallel(0.0, 0.008))]).to_toml([1.0], "An arm"))
+    code = cli.main(["check", str(path), "--input", "12", "--steps", "4", "--json", str(tmp_path / "health.json")])
+    out = capsys.readouterr().out
+    assert code == 0
+    assert out.startswith("An arm\n  status     converged (StrainDependent, float64, ")
+    assert "may grow together to" in out
+    assert "then collapsed" in out
+    saved = json.loads((tmp_path / "health.json").read_text())
+    np.testing.assert_allclose(12 * saved["inputs"]["factor"], 1 / (1 / AXIAL + 0.008**2 / BENDING), rtol=1e-3)
+    assert saved["advice"] == ["all is well"]

@@ -1,0 +1,48 @@
+"""What the commands of `vsr-jax` share: exit codes, the look of their help, and arguments that several take."""
+
+import argparse
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+
+DONE, NOT_CONVERGED, BAD_USAGE = 0, 1, 2
+"""Exit codes."""
+
+EXIT_CODES = "exit codes: 0 done, 1 a solve did not converge, 2 bad usage"
+
+
+def command(commands: Any, name: str, *, example: str, run: Callable, more: str = "", **texts: str) -> argparse.ArgumentParser:
+    """A command with an example, `more` under it, and the exit codes at the end of its help."""
+    epilog = f"example:\n  {example}\n{more}\n{EXIT_CODES}"
+    parser = commands.add_parser(name, epilog=epilog, formatter_class=argparse.RawDescriptionHelpFormatter, **texts)
+    parser.set_defaults(run=run)
+    return parser
+
+
+def positive(text: str) -> int:
+    """A whole number of at least 1."""
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"got {text}, need a whole number >= 1")
+    return number
+
+
+def check_folders(*paths: str | None) -> None:
+    """Refuses what could not be written, before the work is done."""
+    for path in paths:
+        if path is not None and not Path(path).parent.is_dir():
+            raise ValueError(f"{path}: there is no folder {str(Path(path).parent)!r}")
+
+
+def hasten(*, optimise: bool) -> None:
+    """Has XLA compile a program that runs once in half the time, unless XLA_FLAGS says what to do; comes before anything is computed.
+
+    Kernels are emitted without MLIR, whose passes cost a hundredth of a second for each of them, and if not `optimise` they are
+    left as they are. A flag that a release does not know ends the process: so only for releases that know these.
+    """
+    if jax.__version_info__ < (0, 11):
+        flags = ("--xla_cpu_use_fusion_emitters=false", *["--xla_backend_optimization_level=0"] * (not optimise))
+        os.environ.setdefault("XLA_FLAGS", " ".join(flags))

@@ -1,0 +1,175 @@
+"""The commands that take a scene file: `solve` solves it, `check` says how healthy the solve is."""
+
+import argparse
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .basis import Basis, Legendre
+from .cli_common import DONE, NOT_CONVERGED, check_folders, command, hasten, positive
+from .discrete import Prescribed
+from .equilibrium import Equilibrium
+from .health import check
+from .model import Model
+from .scene import Scene
+from .scenefile import load_scene
+from .solve import solve
+from .strain_dependent import StrainDependent
+
+MODELS = ("strain-dependent", "prescribed", "continuum")
+"""Names of the models in the order of how often they are wanted."""
+
+LEGENDRE_ORDER = 8
+"""Order of the Legendre polynomials that `--model prescribed` takes for each free strain."""
+
+STATIONS = 41
+"""How many stations, evenly spaced from base to tip, go into a picture and a JSON file."""
+
+_SCENE_EXAMPLE = """
+a scene file:
+  inputs = [10.0, 5.0]                # tensions [N]; --inputs goes first
+  [rod]
+  length = 0.75                       # SI units throughout
+  section = { type = "Circular", radius = { type = "Taper", base = 0.012, tip = 0.010 } }
+  material = { young = 5.93e5, shear = 2.00e5 }
+  [[actuators]]
+  type = "Tendon"
+  routing = { type = "Helix", radius = 0.005, angle = 1.529 }
+  [[actuators]]
+  type = "Tendon"
+  routing = { type = "Parallel", y = 0.0, z = 0.005 }
+"""
+
+
+def add_solve(commands: Any) -> None:
+    """Adds the command `solve`."""
+    parser = command(
+        commands,
+        "solve",
+        help="solve a scene file and print, draw or save the result",
+        description="Solves the scene of a TOML file and prints status, tip, stability and threads.",
+        example="vsr-jax solve scene.toml --inputs 8 2.5 --plot arm.png --json arm.json",
+        more=_SCENE_EXAMPLE,
+        run=_solve,
+    )
+    _add_scene(parser)
+    parser.add_argument("--plot", metavar="FILE", help="draw the arm into a picture: .png, .pdf, .svg")
+    parser.add_argument("--json", metavar="FILE", help="save inputs, status, tip, positions, strains, threads and stability")
+
+
+def add_check(commands: Any) -> None:
+    """Adds the command `check`."""
+    parser = command(
+        commands,
+        "check",
+        help="say how healthy the solve of a scene file is",
+        description="Solves the scene of a TOML file, and some seventy others around it. Prints the status, the margin of stability,\n"
+        "how far inputs and loads may grow and what ends it, by how much finer steps move the tip, and the conditioning,\n"
+        "with advice.",
+        example="vsr-jax check scene.toml --inputs 8 2.5",
+        run=_check,
+    )
+    _add_scene(parser)
+    parser.add_argument("--json", metavar="FILE", help="save the report")
+
+
+def _add_scene(parser: argparse.ArgumentParser) -> None:
+    """The arguments that say what is solved, and how."""
+    parser.add_argument("scene", metavar="SCENE", help="the TOML file")
+    parser.add_argument(
+        "--inputs", "--input", metavar="U", nargs="*", type=float, help="one number an actuator (default: those of the file)"
+    )
+    parser.add_argument(
+        "--model",
+        choices=MODELS,
+        help=f"how to solve (default: vsr.solve chooses); prescribed: Legendre polynomials to order {LEGENDRE_ORDER} for each free strain",
+    )
+    parser.add_argument("--steps", metavar="N", type=positive, help="steps along the arm (default: the model's)")
+    parser.add_argument("--precision", choices=("float64", "float32"), default="float64", help="of all numbers (default: %(default)s)")
+
+
+class _Task(NamedTuple):
+    """What the command line and the file ask for."""
+
+    scene: Scene
+    inputs: Array
+    model: Model | None
+    title: str
+
+
+def _task(options: argparse.Namespace) -> _Task:
+    if options.precision == "float64":
+        jax.config.update("jax_enable_x64", True)
+    scene, inputs, title = load_scene(options.scene)
+    inputs = inputs if options.inputs is None else options.inputs
+    if inputs is None and scene.actuators:
+        kinds = ", ".join(type(actuator).__name__ for actuator in scene.actuators)
+        raise ValueError(f"{options.scene}: holds no inputs, need --inputs, one number each for {kinds}")
+    values = jnp.asarray([] if inputs is None else inputs, options.precision)
+    return _Task(scene, values, _model(options.model, options.steps, scene), title or options.scene)
+
+
+def _solve(options: argparse.Namespace) -> int:
+    hasten(optimise=False)
+    scene, inputs, model, title = _task(options)
+    check_folders(options.plot, options.json)
+    eq = solve(scene, inputs, model=model)
+    _tell(eq, title, options)
+    return DONE if bool(eq.converged) else NOT_CONVERGED
+
+
+def _check(options: argparse.Namespace) -> int:
+    from . import report
+
+    hasten(optimise=True)
+    scene, inputs, model, title = _task(options)
+    check_folders(options.json)
+    health = check(scene, inputs, model=model)
+    print("\n".join(report.health_lines(health, title)))
+    if options.json:
+        _save(options.json, {"scene": options.scene, "title": title, **report.health_record(health)})
+    return DONE if bool(health.equilibrium.converged) else NOT_CONVERGED
+
+
+def _tell(eq: Equilibrium, title: str, options: argparse.Namespace) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from . import plot, report
+
+    print("\n".join(report.lines(eq, title)))
+    samples = None
+    if bool(eq.converged) and (options.plot or options.json):
+        samples = plot.sample(eq, np.linspace(0.0, float(eq.scene.rod.length), STATIONS))
+    if options.json:
+        _save(options.json, {"scene": options.scene, "title": title, **report.record(eq, samples)})
+    if options.plot and samples is not None:
+        ax = plot.arm(samples)
+        ax.set_title(title)
+        ax.figure.savefig(options.plot, dpi=200, bbox_inches="tight")
+    elif options.plot:
+        print(f"vsr-jax: {options.plot} is not drawn, there is no shape", file=sys.stderr)
+
+
+def _save(path: str, content: dict[str, Any]) -> None:
+    Path(path).write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _model(name: str | None, steps: int | None, scene: Scene) -> Model | None:
+    if name is None and steps is None:
+        return None
+    if name == "continuum":
+        from .continuum import Continuum
+
+        if steps is not None:
+            raise ValueError("--steps: the continuum model chooses its steps by itself")
+        return Continuum()
+    chosen = Prescribed(Basis.uniform(Legendre(LEGENDRE_ORDER), scene.free_strains)) if name == "prescribed" else StrainDependent()
+    return chosen if steps is None else replace(chosen, steps=steps)
