@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import vsr_jax
-from vsr_jax import cli, paper
+from vsr_jax import cli, cli_common, cli_scene, paper
 from vsr_jax.scenefile import parse_scene
 
 HELIX = str(pathlib.Path(__file__).parents[1] / "notebooks" / "scenes" / "helix.toml")
@@ -50,7 +50,7 @@ def collapsed(tmp_path_factory):
 
 
 def test_solve_saves_the_papers_helix(solved):
-    assert solved.code == cli.DONE
+    assert solved.code == cli_common.DONE
     arm, expected = solved.arm, paper.reference("B1")[0]
     assert expected.tau == -15.0
     assert (arm["status"], arm["converged"], arm["precision"], arm["inputs"]) == ("converged", True, "float64", [-15.0])
@@ -80,7 +80,7 @@ def test_solve_prints_the_result_in_words(solved):
 
 
 def test_a_solve_that_fails_says_why(collapsed):
-    assert collapsed.code == cli.NOT_CONVERGED
+    assert collapsed.code == cli_common.NOT_CONVERGED
     assert re.search(r"status +collapsed: ", collapsed.out)
     assert collapsed.err.endswith("arm.png is not drawn, there is no shape\n")
     assert not (collapsed.folder / "arm.png").exists()
@@ -100,7 +100,7 @@ def test_a_solve_that_fails_says_why(collapsed):
     ids=["file", "number of inputs", "nan", "folder"],
 )
 def test_bad_usage_is_one_line_and_exit_code_2(arguments, message, capsys):
-    assert cli.main(["solve", *arguments]) == cli.BAD_USAGE
+    assert cli.main(["solve", *arguments]) == cli_common.BAD_USAGE
     out, err = capsys.readouterr()
     assert re.match(message, err)
     assert err.count("\n") == 1
@@ -110,7 +110,7 @@ def test_bad_usage_is_one_line_and_exit_code_2(arguments, message, capsys):
 def test_a_file_without_inputs_asks_for_them(tmp_path, capsys):
     path = tmp_path / "arm.toml"
     path.write_text(re.sub("inputs = .*", "", pathlib.Path(HELIX).read_text()))
-    assert cli.main(["solve", str(path)]) == cli.BAD_USAGE
+    assert cli.main(["solve", str(path)]) == cli_common.BAD_USAGE
     assert "arm.toml: holds no inputs, need --inputs, one number each for Thread" in capsys.readouterr().err
 
 
@@ -118,14 +118,14 @@ def test_a_file_without_inputs_asks_for_them(tmp_path, capsys):
 def test_arguments_that_cannot_be_read_exit_with_2(option, capsys):
     with pytest.raises(SystemExit) as exit_:
         cli.main(["solve", HELIX, *option])
-    assert exit_.value.code == cli.BAD_USAGE
+    assert exit_.value.code == cli_common.BAD_USAGE
     assert option[0] in capsys.readouterr().err
 
 
 def test_every_model_has_a_name(helix):
-    kinds = [type(cli._model(name, helix)).__name__ for name in cli.MODELS]
+    kinds = [type(cli_scene._model(name, None, helix)).__name__ for name in cli_scene.MODELS]
     assert kinds == ["StrainDependent", "Prescribed", "Continuum"]
-    assert cli._model(None, helix) is None
+    assert cli_scene._model(None, None, helix) is None
 
 
 def test_help_shows_a_scene_file_that_loads(capsys):

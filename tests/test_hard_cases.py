@@ -214,3 +214,11 @@ def test_twenty_threads_in_a_ring_only_shorten_the_arm(dtype):
 def test_throw_raises_with_the_status_in_words(name, words):
     with pytest.raises(vsr.SolveError, match=words):
         vsr.solve(*TABLE[name][:2], model=MODEL, throw=True)
+
+
+def test_two_hundred_drawn_arms_are_right_or_say_why():
+    from benchmarks.hard_search import search
+
+    counts, wrong = search(200, loaded=False)
+    assert wrong == []
+    assert counts["converged"] > 50

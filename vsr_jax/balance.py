@@ -125,14 +125,17 @@ def with_locked(xi: Vector, locked: Vector, free: tuple[int, ...]) -> Vector:
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(3,))
-def solve_balance(sections: CrossSections, tau: Vector, reaction: Vector | None = None, free: tuple[int, ...] = ALL) -> Balance:
+def solve_balance(
+    sections: CrossSections, tau: Vector, reaction: Vector | None = None, free: tuple[int, ...] = ALL, start: Vector | None = None
+) -> Balance:
     r"""Strain that balances each cross-section (eq. 21), by Newton's method from the rest strain.
 
     Where $H$ is not positive definite the step is $\Sigma^{-1} r$. Derivatives of any order are implicit,
     $d\xi = -H^{-1} dr$, in forward and reverse mode.
 
     **Arguments:** component arrays of one shape; `reaction` is left out where there are no external loads; `free`: places
-    of the strains that are solved for, the others keep their rest value.
+    of the strains that are solved for, the others keep their rest value; `start`: where to start instead, since under loads a
+    section that is pushed may have several balances.
 
     **Returns:** a `Balance`. `xi` is the last iterate whether or not it is balanced.
     """
@@ -152,21 +155,22 @@ def solve_balance(sections: CrossSections, tau: Vector, reaction: Vector | None 
         size = jnp.sqrt(dot(step, multiply(chosen(stiffness, free), step)) * compliance[3])
         return Evaluation(spread(step, free), size, jnp.sqrt(dot(r, elastic) * compliance[3]), definite)
 
-    xi, definite, steps = newton(evaluate, rest, floor)
+    first = rest if start is None else with_locked(start, rest, free)
+    xi, definite, steps = newton(evaluate, first, floor)
     imbalance = spread(chosen(residual(xi, sections, tau, reaction), free), free)
     return Balance(xi, strain_norm(imbalance, stiffness) <= 16 * floor, definite, steps)
 
 
 @partial(solve_balance.defjvp, symbolic_zeros=True)
 def _solve_balance_jvp(free: tuple[int, ...], primals: tuple, tangents: tuple) -> tuple[Balance, Balance]:
-    sections, tau, reaction = primals
-    solution = solve_balance(sections, tau, reaction, free)
+    sections, tau, reaction, start = primals
+    solution = solve_balance(sections, tau, reaction, free, start)
     # Where nothing was balanced there is no derivative: take it at rest without forces, where it is finite, so that no
     # other lane of a batch is harmed.
     sound = solution.balanced & solution.definite
     xi = tuple(jnp.where(sound, x, rest) for x, rest in zip(solution.xi, sections.rest, strict=True))
 
-    def imbalance(sections: CrossSections, tau: Vector, reaction: Vector | None) -> Vector:
+    def imbalance(sections: CrossSections, tau: Vector, reaction: Vector | None, _: Vector | None) -> Vector:
         return residual(with_locked(xi, sections.rest, free), sections, forces_where(sound, tau), reaction)
 
     change = change_of(imbalance, primals, tangents)

@@ -102,7 +102,7 @@ def damped_newton(
     The loads come in equal shares, one more with every step taken until all are there, and such a step is always taken:
     what matters of the way is only where it leads. All at once they often make the tangent indefinite at the start.
     The tangent may be approximate. Where it is much too stiff for a soft motion of the arm, what is left of the residual along
-    a full step is a share $\rho$ near 1, and the steps would shrink by it alone: so the next takes $\rho^2 / (1 - \rho)$ of the last
+    a full step is a share $\rho$ near 1, and the steps shrink by it alone: so the next takes $\rho^2 / (1 - \rho)$ of the last
     step with it, the rest of the geometric series. The end is reached when an undamped step is negligible, without taking it, so that the
     residual returned is that of the point returned. Problems may stand side by side, in the last axes of all arrays: each
     goes its own way and stands still when it is done.
@@ -132,7 +132,8 @@ def damped_newton(
         better = (old.given < shares) | (left >= -old.pull) | (new.merit < old.merit) | (new.merit < floor)
         taken = ~old.fresh | (jnp.isfinite(new.merit) & better)
         damping = jnp.where(taken & new.definite, damping, _raised(jnp.where(taken, damping, old.damping)))
-        more = jnp.where((old.damping == 0) & (damping == 0) & old.fresh & (old.given == shares), _extrapolated(left / old.pull), 0.0)
+        whole = (old.damping == 0) & (damping == 0) & old.fresh & (old.given == shares) & (new.merit > 4 * floor)
+        more = jnp.where(whole, _extrapolated(jnp.minimum(left / old.pull, new.size / old.size)), 0.0)
         new = new._replace(step=jax.tree.map(lambda s, last: s + more.astype(s.dtype) * last, new.step, step))
         there = _Guard(new.size, new.merit, new.definite, work(new.residual, new.step), damping, given, new.definite, old.spent)
         here = old._replace(damping=damping, fresh=jnp.zeros_like(taken))

@@ -1,7 +1,8 @@
 r"""Whether the steps along an arm are fine enough for its shape, from the strain at their nodes and the threads' paths alone.
 
-Two errors of the tip are estimated as shares of the arm's length; $|\cdot|$ are root mean squares along the arm with the
-weight $1 - X/L$, since what is bent near the base moves the tip most, and s is the number of Gauss nodes of a step.
+Two errors of the tip are estimated, of its place as a share of the arm's length and of its angle; $|\cdot|$ are root mean squares
+along the arm with the weight $1 - 0.7 X/L$, since what is bent near the base moves the tip most, what is bent near the tip
+turns it; and s is the number of Gauss nodes of a step.
 
 - Quadrature. A wave of curvature with amplitude a that turns by $\psi$ in a step has there the relative error of Gauss-Legendre
   quadrature, $\epsilon = \psi^{2s} (s!)^4 / ((2s + 1) (2s)!^3)$, at most 1. The errors of N steps have phases too: together they
@@ -27,6 +28,7 @@ from .scene import CrossSections
 COARSE = 0.1
 """Estimated error of the tip, as a share of the arm's length, from which on a shape counts as under-resolved."""
 
+_TURNED = 0.7
 _NEGLECTED = {1: 1 / 12, 2: 1 / 720, 3: 1 / 30240}
 
 
@@ -38,9 +40,9 @@ def step_error(xi: Vector, sections: CrossSections, forces: Vector, grid: Grid) 
     """
     k, sections, forces, grid = lax.stop_gradient(c.single((xi[:3], sections, forces, grid)))
     stages, length = grid.X.shape[0], jnp.sum(grid.h)
-    lever = grid.weight * (1 - grid.X / length)
+    lever = grid.weight * (1 - _TURNED * grid.X / length)
     before, here, after, gap, span = _neighbours(k)
-    weight = (grid.h * (1 - jnp.mean(grid.X, axis=0) / length))[: here[0].size]
+    weight = (grid.h * (1 - _TURNED * jnp.mean(grid.X, axis=0) / length))[: here[0].size]
     change = tuple((b - a) / span for a, b in zip(before, after, strict=True))
     first = (span / 2) ** 2 * jnp.sum(weight * c.dot(change, change))
     bent = tuple(x - a - gap * d for x, a, d in zip(here, before, change, strict=True))
@@ -48,13 +50,15 @@ def step_error(xi: Vector, sections: CrossSections, forces: Vector, grid: Grid) 
     total = jnp.sum(weight)
     phase = 2 * jnp.arctan2(jnp.sqrt(second), jnp.sqrt(first)) / (span / 2)
     error = _quadrature(phase, jnp.sqrt(total) * _ratio(first + second, 2 * jnp.sqrt(second)), grid)
+    softest = jnp.minimum(sections.stiffness[1], sections.stiffness[2])
+    hardest = jnp.max(softest)
+    softer = softest / hardest  # the square of a thin arm's stiffness is beyond single precision
     for path, reach, force in zip(sections.paths, sections.reach, forces, strict=True):
         square, slope = path.y**2 + path.z**2, path.slope_y**2 + path.slope_z**2
         inside = lever if reach is None else reach * lever
         phase = jnp.sqrt(_ratio(jnp.sum(inside * slope), jnp.sum(inside * square))) * length / grid.h.size
-        softest = jnp.minimum(sections.stiffness[1], sections.stiffness[2])
-        bending = square / softest / softest
-        error = jnp.maximum(error, _quadrature(phase, jnp.abs(force) * jnp.sqrt(jnp.sum(lever) * jnp.sum(inside * bending)), grid))
+        bend = jnp.abs(force) / hardest * jnp.sqrt(jnp.sum(lever) * jnp.sum(inside * square / softer**2))
+        error = jnp.maximum(error, _quadrature(phase, bend, grid))
     turn = grid.h[: here[0].size] ** 2 * c.dot(here, here)
     series = jnp.sum(weight * turn ** (2 * stages - 1) * c.dot(change, change))
     return error + _NEGLECTED[stages] * jnp.sqrt(total * series)

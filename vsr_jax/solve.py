@@ -60,7 +60,7 @@ def resolved(model: Model, scene: Scene, outcome: Outcome) -> Outcome:
     error = model.step_error(scene, outcome.forces, outcome.state)
     if error is None:
         return outcome
-    coarse = (outcome.status == Status.CONVERGED) & (error > COARSE)
+    coarse = (outcome.status == Status.CONVERGED) & ~(error <= COARSE)
     return outcome._replace(status=jnp.where(coarse, Status.UNDER_RESOLVED, outcome.status).astype(jnp.int32))
 
 
