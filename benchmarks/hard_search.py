@@ -205,10 +205,10 @@ def verdict(draw: Draw) -> str:
         return status.name.lower() if np.all(np.isnan(found.tip)) else "wrong: failed, with a shape"
     if not np.all(np.isfinite(found.gradient)):
         return "wrong: no gradient"
-    if not residual(draw, forces, found.strain) < BALANCED[draw.weight > 0]:
-        return "wrong: not in balance"
     if found.fine_status != vsr.Status.CONVERGED:
         return f"converged, but twice the steps say {vsr.Status(int(found.fine_status)).name.lower()}"
+    if not residual(draw, forces, found.strain) < BALANCED[draw.weight > 0]:
+        return "wrong: not in balance"
     same = np.linalg.norm(found.fine_tip - found.tip) <= SAME * draw.length
     return "converged" if same else "wrong: another shape with twice the steps"
 

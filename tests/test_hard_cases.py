@@ -220,5 +220,7 @@ def test_two_hundred_drawn_arms_are_right_or_say_why():
     from benchmarks.hard_search import search
 
     counts, wrong = search(200, loaded=False)
-    assert wrong == []
+    assert not wrong, repr(wrong)
     assert counts["converged"] > 50
+    # a section may collapse between two nodes; twice the steps see it
+    assert sum(count for said, count in counts.items() if "twice" in said) <= 4
