@@ -134,8 +134,8 @@ def solve_balance(
     $d\xi = -H^{-1} dr$, in forward and reverse mode.
 
     **Arguments:** component arrays of one shape; `reaction` is left out where there are no external loads; `free`: places
-    of the strains that are solved for, the others keep their rest value; `start`: where to start instead, since under loads a
-    section that is pushed may have several balances.
+    of the strains that are solved for, the others keep their rest value; `start`: where to start instead: a section that is
+    pushed under loads may have several balances, and near collapse Newton's method may miss the one there is.
 
     **Returns:** a `Balance`. `xi` is the last iterate whether or not it is balanced.
     """

@@ -72,5 +72,5 @@ class StrainDependent(SteppedModel):
         loads = loading(scene, grid)
         reaction = None if loads is None else react_at(state.xi, grid, loads, X)
         tau = shared(forces, shares_at(scene, state.turning, grid, X))
-        start = None if loads is None else tuple(jnp.interp(X, grid.X.T.reshape(-1), x.T.reshape(-1)) for x in state.xi)
+        start = tuple(jnp.interp(X, grid.X.T.reshape(-1), x.T.reshape(-1)) for x in state.xi)
         return solve_balance(scene.sections(X), tau, reaction, scene.free, start).xi
