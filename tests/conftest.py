@@ -15,6 +15,7 @@ with jaxtyping.install_import_hook("vsr_jax", "beartype.beartype"):
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 jax.config.update("jax_enable_x64", True)
@@ -25,6 +26,15 @@ from vsr_jax import paper  # noqa: E402
 def epsilon(dtype) -> float:
     """Machine epsilon: tolerances are written as multiples of it."""
     return float(jnp.finfo(dtype).eps)
+
+
+def central_differences(function, size):
+    """Derivative at zero of a function of a vector of `size` numbers, by steps of one, of fourth order."""
+
+    def change(unit):
+        return (8 * (function(unit) - function(-unit)) - (function(2 * unit) - function(-2 * unit))) / 12
+
+    return np.stack([change(unit) for unit in np.eye(size)])
 
 
 @pytest.fixture(params=["float32", "float64"])

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import epsilon
+from conftest import central_differences, epsilon
 
 import vsr_jax as vsr
 from vsr_jax import paper
@@ -45,13 +45,13 @@ def stiffness(radius, young):
     return axial, axial * radius**2 / 4, axial / 2.9
 
 
-def arc(angle, radius=0.01, young=1e6, length=0.3, status=vsr.Status.CONVERGED):
+def arc(angle, radius=0.01, young=1e6, length=0.3):
     """A parallel thread bends the arm by an angle into a circle of known size: $k_y = \\tau d / EI$, $u_x = 1 + \\tau / EA$."""
     axial, bending, _ = stiffness(radius, young)
     force = -bending * angle / (0.8 * radius * length)
     u = 1 + force / axial
     tip = (u * math.sin(angle) / angle, 0.0, u * (1 - math.cos(angle)) / angle)
-    return Case(arm((0.0, 0.8 * radius), radius=radius, young=young, length=length), (force, 0.0), tip, status)
+    return Case(arm((0.0, 0.8 * radius), radius=radius, young=young, length=length), (force, 0.0), tip)
 
 
 def cone(force, length=0.3, radius=0.01, tip=0.01, young=1e6):
@@ -140,12 +140,7 @@ def solved(case, dtype, offset=(0.0, 0.0)):
 def differences(case, name):
     """Derivative of one of the answers by both forces, by central differences of fourth order."""
 
-    def at(i, step):
-        offset = np.zeros(2)
-        offset[i] = step
-        return getattr(solved(case, "float64", offset), name)
-
-    return np.stack([(8 * (at(i, 1) - at(i, -1)) - (at(i, 2) - at(i, -2))) / 12 for i in (0, 1)])
+    return central_differences(lambda change: getattr(solved(case, "float64", change), name), 2)
 
 
 @pytest.mark.parametrize("name", TABLE)

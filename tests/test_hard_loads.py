@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import epsilon
+from conftest import central_differences, epsilon
 
 import vsr_jax as vsr
 
@@ -100,11 +100,7 @@ def at(function, case, dtype, change=(0.0, 0.0)):
 
 def differences(function, case):
     """Derivative of a function by both changes, by central differences of fourth order."""
-
-    def by(i, step):
-        return at(function, case, "float64", np.eye(2)[i] * step)[0]
-
-    return np.stack([(8 * (by(i, 1) - by(i, -1)) - (by(i, 2) - by(i, -2))) / 12 for i in (0, 1)])
+    return central_differences(lambda change: at(function, case, "float64", change)[0], 2)
 
 
 CONVERGED = [name for name, case in TABLE.items() if case.status == vsr.Status.CONVERGED]

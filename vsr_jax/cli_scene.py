@@ -113,7 +113,7 @@ def _task(options: argparse.Namespace) -> _Task:
         kinds = ", ".join(type(actuator).__name__ for actuator in scene.actuators)
         raise ValueError(f"{options.scene}: holds no inputs, need --inputs, one number each for {kinds}")
     values = jnp.asarray([] if inputs is None else inputs, options.precision)
-    return _Task(scene, values, _model(options.model, options.steps, scene), title or options.scene)
+    return _Task(scene, values, _model(options.model, options.steps, scene), title)
 
 
 def _solve(options: argparse.Namespace) -> int:
@@ -132,7 +132,7 @@ def _check(options: argparse.Namespace) -> int:
     scene, inputs, model, title = _task(options)
     check_folders(options.json)
     health = check(scene, inputs, model=model)
-    print("\n".join(report.health_lines(health, title)))
+    print("\n".join(report.health_lines(health, title or options.scene)))
     if options.json:
         _save(options.json, {"scene": options.scene, "title": title, **report.health_record(health)})
     return DONE if bool(health.equilibrium.converged) else NOT_CONVERGED
@@ -144,7 +144,7 @@ def _tell(eq: Equilibrium, title: str, options: argparse.Namespace) -> None:
     matplotlib.use("Agg")
     from . import plot, report
 
-    print("\n".join(report.lines(eq, title)))
+    print("\n".join(report.lines(eq, title or options.scene)))
     samples = None
     if bool(eq.converged) and (options.plot or options.json):
         samples = plot.sample(eq, np.linspace(0.0, float(eq.scene.rod.length), STATIONS))

@@ -112,9 +112,10 @@ def _refined(apply: Callable, nearly: Callable, right: Imbalance, weight: Imbala
     alone would then take hundreds of steps; the few directions kept find such a motion at once.
     """
     least = 4 * jnp.finfo(right.wrench[0].dtype).eps
+    still, zero = jax.tree.map(jnp.zeros_like, right), jnp.zeros_like(_largest(right))
 
     def dot(a: Imbalance, b: Imbalance) -> Array:
-        return sum(jax.tree.leaves(jax.tree.map(lambda w, x, y: jnp.sum(w * x * y), weight, a, b)), jnp.zeros_like(zero))
+        return sum(jax.tree.leaves(jax.tree.map(lambda w, x, y: jnp.sum(w * x * y), weight, a, b)), zero)
 
     def proceed(carry: tuple) -> Array:
         *_, correction, whole, count = carry
@@ -135,8 +136,6 @@ def _refined(apply: Callable, nearly: Callable, right: Imbalance, weight: Imbala
         x, r = c.add(x, step), c.subtract(r, c.scale(part, q))
         return x, r, (*kept[1:], (p, q)), _largest(step), _largest(x), count + 1
 
-    still = jax.tree.map(jnp.zeros_like, right)
-    zero = jnp.zeros_like(_largest(right))
     start = still, right, ((still, still),) * _KEPT, zero + jnp.inf, zero, 0
     x, *_, correction, whole, _ = lax.while_loop(proceed, advance, start)
     found = correction <= least**0.5 * whole  # no derivative rather than a wrong one

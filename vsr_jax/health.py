@@ -88,12 +88,12 @@ def check(scene: Scene, inputs: Any, *, model: Model | None = None) -> Health:
 
     **Raises:** `ValueError` as `solve` does.
     """
-    return _check(scene, solve(scene, inputs, model=model))
+    return _check(solve(scene, inputs, model=model))
 
 
 @eqx.filter_jit
-def _check(scene: Scene, eq: Equilibrium) -> Health:
-    inputs, model = eq.inputs, eq.model
+def _check(eq: Equilibrium) -> Health:
+    scene, inputs, model = eq.scene, eq.inputs, eq.model
     finer = solve(scene, inputs, model=model.finer())
 
     def status_at(of_inputs: Scalar, of_loads: Scalar) -> Array:
