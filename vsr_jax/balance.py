@@ -124,6 +124,12 @@ def with_locked(xi: Vector, locked: Vector, free: tuple[int, ...]) -> Vector:
     return tuple(x if i in free else jnp.broadcast_to(y, x.shape) for i, (x, y) in enumerate(zip(xi, locked, strict=True)))
 
 
+def newton_step(xi: Vector, sections: CrossSections, tau: Vector, reaction: Vector | None, free: tuple[int, ...]) -> tuple[Vector, Vector]:
+    """Residual $r$ of the free strains and the step $H^{-1} r$ to subtract, whose last is NaN where $H$ is not positive definite."""
+    r = chosen(residual(xi, sections, tau, reaction), free)
+    return r, cholesky_solve(cholesky(chosen_rows(tangent(xi, sections, tau), free)), r)
+
+
 @partial(jax.custom_jvp, nondiff_argnums=(3,))
 def solve_balance(
     sections: CrossSections, tau: Vector, reaction: Vector | None = None, free: tuple[int, ...] = ALL, start: Vector | None = None
@@ -147,9 +153,8 @@ def solve_balance(
     compliance = tuple(1 / s for s in stiffness)
 
     def evaluate(xi: Vector) -> Evaluation:
-        r = chosen(residual(xi, sections, tau, reaction), free)
+        r, step = newton_step(xi, sections, tau, reaction, free)
         elastic = multiply(chosen(compliance, free), r)
-        step = cholesky_solve(cholesky(chosen_rows(tangent(xi, sections, tau), free)), r)
         definite = ~jnp.isnan(step[-1])
         step = tuple(jnp.where(definite, x, e) for x, e in zip(step, elastic, strict=True))
         size = jnp.sqrt(dot(step, multiply(chosen(stiffness, free), step)) * compliance[3])

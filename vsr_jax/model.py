@@ -49,6 +49,10 @@ _MESSAGES = {
 }
 
 
+_NOTHING = 1e-4
+"""Share of its length at rest from which on a path counts as shortened to nothing."""
+
+
 class Nodes(NamedTuple):
     """A grid and, at its nodes, the strain, the cross-sections and the share of each thread's force (None for all of it)."""
 
@@ -130,7 +134,7 @@ class SteppedModel(Model):
 
     def step_error(self, scene: Scene, forces: Vector, state: Any) -> Scalar:
         nodes = self.nodes(scene, forces, state)
-        return step_error(nodes.xi, nodes.sections, forces, nodes.grid)
+        return step_error(nodes.xi, nodes.sections, forces, nodes.grid, loaded=bool(scene.loads))
 
     @abstractmethod
     def node_strain(self, scene: Scene, state: Any) -> Vector:
@@ -152,8 +156,9 @@ def classify(xi: Vector, sections: CrossSections, tau: Vector, balanced: Array, 
     """`Status` from the strain, whether it balances and whether the tangent is positive definite, over all nodes.
 
     With tendons alone (not `loaded`) the energy is convex, so a node that cannot be balanced has its least energy at a kink,
-    where the path of a thread has no length left: it has collapsed. So has a node where a path, or the axis, has turned over,
-    and under loads, where it cannot be balanced, one with a thread that alone would shorten its path to nothing.
+    where the path of a thread has no length left: it has collapsed. So has a node where a path, or the axis, is shortened to
+    less than a ten-thousandth or has turned over, and under loads, where it cannot be balanced, one with a thread that alone would
+    shorten its path to nothing.
     """
     pulling = jnp.array(False)
     if tau and loaded:
@@ -166,7 +171,7 @@ def classify(xi: Vector, sections: CrossSections, tau: Vector, balanced: Array, 
         share = dot(thread_tangent(xi, path), rest) / dot(rest, rest)
         left = jnp.minimum(left, share if reach is None else jnp.where(reach > 0, share, 1.0))
     finite = jnp.all(jnp.isfinite(sum(xi)))
-    collapsed = jnp.any(~balanced & pulling) | jnp.any(left <= 0)
+    collapsed = jnp.any(~balanced & pulling) | jnp.any(left <= _NOTHING)
     status = jnp.where(jnp.all(balanced), Status.CONVERGED, Status.MAX_STEPS)
     lost = ~jnp.all(definite)
     status = jnp.where(lost & jnp.all(balanced) if loaded else lost, Status.UNSTABLE, status)

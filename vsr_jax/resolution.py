@@ -1,6 +1,6 @@
 r"""Whether the steps along an arm are fine enough for its shape, from the strain at their nodes and the threads' paths alone.
 
-Two errors of the tip are estimated, of its place as a share of the arm's length and of its angle; $|\cdot|$ are root mean squares
+Errors of the tip are estimated, of its place as a share of the arm's length and of its angle; $|\cdot|$ are root mean squares
 along the arm with the weight $1 - 0.7 X/L$, since what is bent near the base moves the tip most, what is bent near the tip
 turns it; and s is the number of Gauss nodes of a step.
 
@@ -8,7 +8,10 @@ turns it; and s is the number of Gauss nodes of a step.
   quadrature, $\epsilon = \psi^{2s} (s!)^4 / ((2s + 1) (2s)!^3)$, at most 1. The errors of N steps have phases too: together they
   are $1 / (N |\sin(\psi / 2)|)$ of their sum, from $N^{-1/2}$ to 1. The wave is the greater of two: that through neighbouring
   nodes, whose second and first difference are $a (1 - \cos \varphi)$ and $a \sin \varphi$; and that which each thread lays,
-  $\psi = h |d'| / |d|$, $a = |\tau d / EI|$, which no choice of nodes can hide.
+  $\psi = h |d'| / |d|$, $a = |\tau d / EI|$, which no choice of nodes can hide. So does the shear $|\tau d'| / (GA - \tau)$
+  of that wave, which grows without bound where a thread that pushes takes the arm's stiffness in shear.
+- Boundary layers. A force $|N|$ that loads ask of a section bends it over a length $\sqrt{EI / |N|}$: at a clamp, at a tip that
+  carries a moment. Where that is shorter than $h / \pi$ the angle $h |\delta k|$ in which the step bends is in doubt.
 - Magnus series. Its first neglected term where the curvature changes by $\delta k$ over a step, $c_s (h |k|)^{2s-1} |\delta k|$ with
   $c_s = 1/12, 1/720, 1/30240$ (Bernoulli numbers; the series diverges beyond $2 \pi$).
 """
@@ -21,6 +24,7 @@ from jaxtyping import Array
 
 from . import component as c
 from ._types import Scalar
+from .balance import residual
 from .component import Vector
 from .quadrature import Grid, gauss_legendre
 from .scene import CrossSections
@@ -29,20 +33,21 @@ COARSE = 0.1
 """Estimated error of the tip, as a share of the arm's length, from which on a shape counts as under-resolved."""
 
 _TURNED = 0.7
+_STIFF = 1e-3
 _NEGLECTED = {1: 1 / 12, 2: 1 / 720, 3: 1 / 30240}
 
 
-def step_error(xi: Vector, sections: CrossSections, forces: Vector, grid: Grid) -> Scalar:
+def step_error(xi: Vector, sections: CrossSections, forces: Vector, grid: Grid, *, loaded: bool) -> Scalar:
     """Estimate of the tip's error by the steps, as a share of the arm's length.
 
     **Arguments:** strain and cross-sections at the nodes of `grid`, component arrays of shape (stages, steps); the force of
-    each thread at its start.
+    each thread at its start; whether there are external loads.
     """
-    k, sections, forces, grid = lax.stop_gradient(c.single((xi[:3], sections, forces, grid)))
+    xi, sections, forces, grid = lax.stop_gradient(c.single((xi, sections, forces, grid)))
     stages, length = grid.X.shape[0], jnp.sum(grid.h)
-    lever = grid.weight * (1 - _TURNED * grid.X / length)
-    before, here, after, gap, span = _neighbours(k)
-    weight = (grid.h * (1 - _TURNED * jnp.mean(grid.X, axis=0) / length))[: here[0].size]
+    before, here, after, gap, span = _neighbours(xi[:3])
+    h = grid.h[: here[0].size]
+    weight = h * (1 - _TURNED * jnp.mean(grid.X, axis=0) / length)[: h.size]
     change = tuple((b - a) / span for a, b in zip(before, after, strict=True))
     first = (span / 2) ** 2 * jnp.sum(weight * c.dot(change, change))
     bent = tuple(x - a - gap * d for x, a, d in zip(here, before, change, strict=True))
@@ -50,18 +55,38 @@ def step_error(xi: Vector, sections: CrossSections, forces: Vector, grid: Grid) 
     total = jnp.sum(weight)
     phase = 2 * jnp.arctan2(jnp.sqrt(second), jnp.sqrt(first)) / (span / 2)
     error = _quadrature(phase, jnp.sqrt(total) * _ratio(first + second, 2 * jnp.sqrt(second)), grid)
-    softest = jnp.minimum(sections.stiffness[1], sections.stiffness[2])
-    hardest = jnp.max(softest)
-    softer = softest / hardest  # the square of a thin arm's stiffness is beyond single precision
+    for wave in _threads(xi, sections, forces, grid):
+        error = jnp.maximum(error, _quadrature(*wave, grid))
+    if loaded:
+        force = residual(xi, sections, sections.carry(forces))[3:]
+        short = grid.h**2 * jnp.sqrt(c.dot(force, force)) > math.pi**2 * _softest(sections)
+        angle = jnp.where(jnp.any(short, axis=0)[: h.size], span * h * jnp.sqrt(c.dot(change, change)), 0.0)
+        error = jnp.maximum(error, jnp.max(angle, initial=0.0))
+    series = jnp.sum(weight * (h**2 * c.dot(here, here)) ** (2 * stages - 1) * c.dot(change, change))
+    return error + _NEGLECTED[stages] * jnp.sqrt(total * series)
+
+
+def _threads(xi: Vector, sections: CrossSections, forces: Vector, grid: Grid) -> list[tuple[Scalar, Scalar]]:
+    """For each thread by how much its wave turns in a step, and how far it bends and shears the arm in all."""
+    length, waves = jnp.sum(grid.h), []
+    lever = grid.weight * (1 - _TURNED * grid.X / length)
+    softest = _softest(sections)
+    hardest = jnp.max(softest)  # the square of a thin arm's stiffness is beyond single precision
+    pushed = sum((jnp.maximum(force, 0.0) for force in forces), jnp.zeros_like(length)) / xi[3]
+    shear = jnp.minimum(sections.stiffness[4], sections.stiffness[5])
+    shear = jnp.maximum(shear - pushed, _STIFF * shear)
     for path, reach, force in zip(sections.paths, sections.reach, forces, strict=True):
         square, slope = path.y**2 + path.z**2, path.slope_y**2 + path.slope_z**2
         inside = lever if reach is None else reach * lever
         phase = jnp.sqrt(_ratio(jnp.sum(inside * slope), jnp.sum(inside * square))) * length / grid.h.size
-        bend = jnp.abs(force) / hardest * jnp.sqrt(jnp.sum(lever) * jnp.sum(inside * square / softer**2))
-        error = jnp.maximum(error, _quadrature(phase, bend, grid))
-    turn = grid.h[: here[0].size] ** 2 * c.dot(here, here)
-    series = jnp.sum(weight * turn ** (2 * stages - 1) * c.dot(change, change))
-    return error + _NEGLECTED[stages] * jnp.sqrt(total * series)
+        bent = jnp.sqrt(jnp.sum(lever) * jnp.sum(inside * square / (softest / hardest) ** 2)) / hardest
+        sheared = jnp.sqrt(jnp.sum(lever) * jnp.sum(inside * slope / shear**2)) / length
+        waves.append((phase, jnp.abs(force) * (bent + sheared)))
+    return waves
+
+
+def _softest(sections: CrossSections) -> Array:
+    return jnp.minimum(sections.stiffness[1], sections.stiffness[2])
 
 
 def _neighbours(k: Vector) -> tuple[Vector, Vector, Vector, float, float]:

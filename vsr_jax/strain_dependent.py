@@ -6,10 +6,11 @@ are solved together (see `coupled`).
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from ._check import choice, count
-from .balance import forces_where, solve_balance
+from .balance import forces_where, newton_step, solve_balance, spread
 from .component import Vector
 from .coupled import Unknown, problem_of, shares_at, state_of, with_tensions
 from .coupled_solve import solve_arm
@@ -44,6 +45,7 @@ class StrainDependent(SteppedModel):
         tau = sections.carry(forces)
         solution = solve_balance(sections, tau, None, scene.free)
         status = classify(solution.xi, sections, tau, solution.balanced, solution.definite)
+        status = jnp.where(status == Status.CONVERGED, _status_of_ends(scene, forces, solution.xi), status)
         state = Unknown(rest_where_failed(status, solution.xi, sections), (), ())
         return Outcome(state, forces, status, solution.steps)
 
@@ -74,3 +76,15 @@ class StrainDependent(SteppedModel):
         tau = shared(forces, shares_at(scene, state.turning, grid, X))
         start = tuple(jnp.interp(X, grid.X.T.reshape(-1), x.T.reshape(-1)) for x in state.xi)
         return solve_balance(scene.sections(X), tau, reaction, scene.free, start).xi
+
+
+def _status_of_ends(scene: Scene, forces: Vector, xi: Vector) -> Array:
+    """Status of the arm's two ends, which no node sees: a tapering arm fails at its tip first. One Newton step from the
+    strain at the node beside is exact enough to tell."""
+    sections = scene.sections(scene.edges()[jnp.array([0, -1])])
+    tau = sections.carry(forces)
+    beside = lax.stop_gradient(tuple(jnp.stack([x[0, 0], x[-1, -1]]) for x in xi))
+    _, step = newton_step(beside, sections, tau, None, scene.free)
+    definite = ~jnp.isnan(step[-1])
+    there = tuple(jnp.where(definite, x - s, x) for x, s in zip(beside, spread(step, scene.free), strict=True))
+    return classify(there, sections, tau, jnp.ones_like(definite), definite)
