@@ -165,3 +165,23 @@ def test_version(capsys):
         cli.main(["--version"])
     assert exit_.value.code == 0
     assert capsys.readouterr().out.strip() == f"vsr-jax {vsr_jax.__version__}"
+
+
+def test_sweep_keeps_and_draws_a_workspace(tmp_path, capsys):
+    arguments = ["sweep", HELIX, "--samples", "50", "--low", "-15", "--high", "-1", "--steps", "8", "--outputs", "lengths"]
+    assert cli.main([*arguments, "--out", str(tmp_path / "w.zarr"), "--plot", str(tmp_path / "w.png")]) == cli_common.DONE
+    out = capsys.readouterr().out
+    assert "inputs      -15 to -1\nsamples     50 converged\ntip x" in out
+    assert (tmp_path / "w.png").stat().st_size > 10_000
+    kept = pytest.importorskip("zarr").open_group(tmp_path / "w.zarr", mode="r")
+    assert {name: kept[name].shape for name in kept} == {"inputs": (50, 1), "tip": (50, 4, 4), "lengths": (50, 1), "status": (50,)}
+
+
+def test_a_sweep_without_a_solution_exits_with_1(capsys):
+    assert cli.main(["sweep", HELIX, "--samples", "3", "--low", "-9e3", "--high", "-5e3", "--steps", "8"]) == cli_common.NOT_CONVERGED
+    assert "samples     3 collapsed\n" in capsys.readouterr().out
+
+
+def test_bounds_of_a_sweep_are_one_or_one_an_actuator(capsys):
+    assert cli.main(["sweep", HELIX, "--low", "1", "2"]) == cli_common.BAD_USAGE
+    assert "--low: got 2 numbers, need one for all actuators or 1, one for each" in capsys.readouterr().err

@@ -12,8 +12,8 @@ LAYERS = """
 _types _check component implicit se3 quadrature profile section material routing actuator rod load scene newton balance kinematics
 resolution
 cable reaction elimination friction coupled coupled_tangent coupled_solve basis model galerkin discrete
-strain_dependent shooting continuum stability equilibrium solve health continuation
-scenefile plot paper paper_figures reproduce report timing effects cli_common cli_scene cli_studies cli
+strain_dependent shooting continuum stability equilibrium solve health continuation archive sweep
+scenefile plot paper paper_figures reproduce report timing effects cli_common cli_scene cli_sweep cli_studies cli
 """.split()  # noqa: SIM905
 
 

@@ -44,6 +44,17 @@ def test_a_failed_solve_is_not_drawn():
         plot.arm(failed)
 
 
+def test_a_workspace_shows_every_finite_tip_once():
+    tips = np.random.default_rng(0).normal(size=(90, 3))
+    tips[::3] = np.nan
+    axes = plot.workspace(tips, values=np.arange(90), label="number")
+    np.testing.assert_array_equal(axes[2].collections[0].get_offsets(), tips[np.isfinite(tips[:, 0])][:, [0, 2]])
+    assert len(plot.workspace(tips, most=20)[1].collections[0].get_offsets()) == 20
+    with pytest.raises(ValueError, match=r"positions: got shape \(90, 2\), need \(samples, 3\)"):
+        plot.workspace(tips[:, :2])
+    plt.close("all")
+
+
 @pytest.mark.parametrize(
     ("section", "point"),
     [

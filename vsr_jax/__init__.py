@@ -58,6 +58,7 @@ from .section import (
 )
 from .solve import SolveError as SolveError, solve as solve
 from .strain_dependent import StrainDependent as StrainDependent
+from .sweep import Sweep as Sweep, sweep as sweep
 
 if TYPE_CHECKING:
     from .continuum import Continuum as Continuum

@@ -1,4 +1,4 @@
-"""The command `vsr-jax`: scenes solved and checked, the paper run anew, what effects cost."""
+"""The command `vsr-jax`: scenes solved, checked and swept, the paper run anew, what effects cost."""
 
 import argparse
 import sys
@@ -8,8 +8,15 @@ from . import __version__
 from .cli_common import BAD_USAGE, EXIT_CODES
 from .cli_scene import add_check, add_solve
 from .cli_studies import add_effects, add_paper
+from .cli_sweep import add_sweep
 
-EXAMPLES = ("vsr-jax solve scene.toml --plot arm.png", "vsr-jax check scene.toml", "vsr-jax paper --out results", "vsr-jax effects")
+EXAMPLES = (
+    "vsr-jax solve scene.toml --plot arm.png",
+    "vsr-jax check scene.toml",
+    "vsr-jax sweep scene.toml --samples 100000 --plot workspace.png",
+    "vsr-jax paper --out results",
+    "vsr-jax effects",
+)
 """One for each command."""
 
 
@@ -47,6 +54,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     add_solve(commands)
     add_check(commands)
+    add_sweep(commands)
     add_paper(commands)
     add_effects(commands)
     return parser

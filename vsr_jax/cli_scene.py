@@ -59,7 +59,7 @@ def add_solve(commands: Any) -> None:
         more=_SCENE_EXAMPLE,
         run=_solve,
     )
-    _add_scene(parser)
+    add_scene(parser)
     parser.add_argument("--plot", metavar="FILE", help="draw the arm into a picture: .png, .pdf, .svg")
     parser.add_argument("--json", metavar="FILE", help="save inputs, status, tip, positions, strains, threads and stability")
 
@@ -76,11 +76,11 @@ def add_check(commands: Any) -> None:
         example="vsr-jax check scene.toml --inputs 8 2.5",
         run=_check,
     )
-    _add_scene(parser)
+    add_scene(parser)
     parser.add_argument("--json", metavar="FILE", help="save the report")
 
 
-def _add_scene(parser: argparse.ArgumentParser) -> None:
+def add_scene(parser: argparse.ArgumentParser) -> None:
     """The arguments that say what is solved, and how."""
     parser.add_argument("scene", metavar="SCENE", help="the TOML file")
     parser.add_argument(
@@ -95,7 +95,7 @@ def _add_scene(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--precision", choices=("float64", "float32"), default="float64", help="of all numbers (default: %(default)s)")
 
 
-class _Task(NamedTuple):
+class Task(NamedTuple):
     """What the command line and the file ask for."""
 
     scene: Scene
@@ -104,7 +104,11 @@ class _Task(NamedTuple):
     title: str
 
 
-def _task(options: argparse.Namespace) -> _Task:
+def task_of(options: argparse.Namespace) -> Task:
+    """What is to be solved, in the precision asked for.
+
+    **Raises:** `ValueError` for a file or numbers that make no sense.
+    """
     if options.precision == "float64":
         jax.config.update("jax_enable_x64", True)
     scene, inputs, title = load_scene(options.scene)
@@ -113,12 +117,12 @@ def _task(options: argparse.Namespace) -> _Task:
         kinds = ", ".join(type(actuator).__name__ for actuator in scene.actuators)
         raise ValueError(f"{options.scene}: holds no inputs, need --inputs, one number each for {kinds}")
     values = jnp.asarray([] if inputs is None else inputs, options.precision)
-    return _Task(scene, values, _model(options.model, options.steps, scene), title)
+    return Task(scene, values, _model(options.model, options.steps, scene), title)
 
 
 def _solve(options: argparse.Namespace) -> int:
     hasten(optimise=False)
-    scene, inputs, model, title = _task(options)
+    scene, inputs, model, title = task_of(options)
     check_folders(options.plot, options.json)
     eq = solve(scene, inputs, model=model)
     _tell(eq, title, options)
@@ -129,7 +133,7 @@ def _check(options: argparse.Namespace) -> int:
     from . import report
 
     hasten(optimise=True)
-    scene, inputs, model, title = _task(options)
+    scene, inputs, model, title = task_of(options)
     check_folders(options.json)
     health = check(scene, inputs, model=model)
     print("\n".join(report.health_lines(health, title or options.scene)))

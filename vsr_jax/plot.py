@@ -192,6 +192,45 @@ def _panels(number: int) -> np.ndarray:
     return axes.reshape(-1)[:number]
 
 
+def workspace(
+    positions: Any, ax: Any = None, *, values: Any = None, label: str = "", color: Any = COLORS[0], most: int = 20_000
+) -> np.ndarray:
+    """Where the tip gets: a cloud of points in space, and seen along each axis.
+
+    **Arguments:**
+    - `positions`: shape (samples, 3) [m]; rows with a NaN are left out.
+    - `ax`: four axes, the first one 3D; a new figure by default.
+    - `values`, `label`: a number for each point that colours it, and what it is; all of one `color` without.
+    - `most`: how many points are drawn; of more, every so-manieth.
+
+    **Returns:** the axes: in space, then y over x, z over x, z over y.
+    """
+    positions = np.asarray(positions)
+    if positions.ndim != 2 or positions.shape[1] != 3:
+        raise ValueError(f"positions: got shape {positions.shape}, need (samples, 3)")
+    shown = np.flatnonzero(np.all(np.isfinite(positions), axis=1))
+    shown = shown[:: -(-len(shown) // most) or 1]
+    axes = _corner() if ax is None else np.asarray(ax, dtype=object).reshape(-1)
+    points = positions[shown].T
+    style: dict[str, Any] = {"s": 2, "linewidths": 0, "rasterized": True}
+    style |= {"c": color} if values is None else {"c": np.asarray(values)[shown], "cmap": "viridis"}
+    cloud = axes[0].scatter(*points, alpha=0.5, **style)
+    axes[0].set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+    equal_scale(axes[0])
+    for panel, (i, j) in zip(axes[1:], ((0, 1), (0, 2), (1, 2)), strict=True):
+        panel.scatter(points[i], points[j], **style)
+        panel.set(xlabel=f"{'xyz'[i]} [m]", ylabel=f"{'xyz'[j]} [m]")
+        panel.set_aspect("equal", adjustable="box")
+    if values is not None:
+        axes[0].figure.colorbar(cloud, ax=list(axes), label=label, shrink=0.6).solids.set_alpha(1)
+    return axes
+
+
+def _corner() -> np.ndarray:
+    figure = plt.figure(figsize=(9, 7), layout="constrained")
+    return np.array([figure.add_subplot(2, 2, i + 1, projection="3d" if i == 0 else None) for i in range(4)], dtype=object)
+
+
 def shade(color: Any) -> tuple[float, ...]:
     """A darker tone of a colour, for what is drawn over it."""
     return tuple(0.55 * part for part in to_rgb(color))

@@ -1,0 +1,83 @@
+"""The command `sweep`: a scene file solved for many inputs, a workspace in one command."""
+
+import argparse
+import time
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+
+from .cli_common import DONE, NOT_CONVERGED, check_folders, command, one_device_a_core, positive
+from .cli_scene import add_scene, task_of
+from .sweep import OUTPUTS, Sweep, sweep
+
+
+def add_sweep(commands: Any) -> None:
+    """Adds the command `sweep`."""
+    parser = command(
+        commands,
+        "sweep",
+        help="solve a scene file for many inputs: its workspace",
+        description="Draws inputs evenly between two bounds, solves the scene of a TOML file for each, and says where the tip gets.\n"
+        "A sweep to disk that was stopped goes on where it was when the same command is given again. Ends with 1 where no\n"
+        "sample converged.",
+        example="vsr-jax sweep scene.toml --samples 100000 --high 10 5 --out workspace.zarr --plot workspace.png",
+        run=_sweep,
+    )
+    add_scene(parser)
+    parser.add_argument("--samples", metavar="N", type=positive, default=10_000, help="how many (default: %(default)s)")
+    parser.add_argument("--low", metavar="U", nargs="+", type=float, help="least inputs, one for all or one an actuator (default: 0)")
+    parser.add_argument("--high", metavar="U", nargs="+", type=float, help="greatest inputs (default: --inputs, or those of the file)")
+    parser.add_argument("--seed", type=int, default=0, help="of the random numbers (default: %(default)s)")
+    parser.add_argument("--outputs", nargs="+", choices=OUTPUTS, default=["tip"], help="what to keep besides the status (default: tip)")
+    parser.add_argument("--out", metavar="DIR", help='a Zarr folder for inputs and outputs, which xarray reads; needs "vsr-jax[sweep]"')
+    parser.add_argument("--plot", metavar="FILE", help="draw the tips into a picture: .png, .pdf, .svg")
+
+
+def _sweep(options: argparse.Namespace) -> int:
+    one_device_a_core()
+    task = task_of(options)
+    check_folders(options.out, options.plot)
+    actuators, dtype = len(task.scene.actuators), task.inputs.dtype
+    low = _bounds("--low", [0.0] if options.low is None else options.low, actuators)
+    high = _bounds("--high", np.asarray(task.inputs) if options.high is None else options.high, actuators)
+    inputs = np.random.default_rng(options.seed).uniform(low, high, (options.samples, actuators)).astype(dtype)
+    outputs = tuple(dict.fromkeys([*options.outputs, "tip"]))
+    start = time.perf_counter()
+    result = sweep(task.scene, inputs, outputs=outputs, model=task.model, out=options.out)
+    seconds = time.perf_counter() - start
+    tips = np.asarray(result["tip"])[:, :3, 3]
+    print("\n".join(_lines(task.title or options.scene, low, high, result, tips)))
+    print(f"time        {seconds:.1f} s, compiling included")
+    if options.plot:
+        _draw(options.plot, task.title, tips, inputs, low, high)
+    return DONE if np.any(result.converged) else NOT_CONVERGED
+
+
+def _bounds(name: str, values: Any, actuators: int) -> np.ndarray:
+    if len(values) not in (1, actuators):
+        raise ValueError(f"{name}: got {len(values)} numbers, need one for all actuators or {actuators}, one for each")
+    return np.broadcast_to(np.asarray(values, float), actuators)
+
+
+def _lines(title: str, low: np.ndarray, high: np.ndarray, result: Sweep, tips: np.ndarray) -> list[str]:
+    """What a sweep found, in words."""
+    ranges = ", ".join(f"{a:g} to {b:g}" for a, b in zip(low, high, strict=True))
+    counts = ", ".join(f"{number:,} {status}" for status, number in result.counts.items())
+    lines = [title, f"inputs      {ranges}", f"samples     {counts}"]
+    if np.any(result.converged):
+        extents = zip("xyz", np.nanmin(tips, axis=0), np.nanmax(tips, axis=0), strict=True)
+        lines += [f"tip {axis}       {least:.6g} to {most:.6g} m" for axis, least, most in extents]
+    return lines
+
+
+def _draw(path: str, title: str, tips: np.ndarray, inputs: np.ndarray, low: np.ndarray, high: np.ndarray) -> None:
+    matplotlib.use("Agg")
+    from . import plot
+
+    varied = high != low  # of many inputs the mean says nothing
+    share = np.mean((inputs - low)[:, varied] / (high - low)[varied], axis=1) if 0 < np.sum(varied) < 4 else None
+    axes = plot.workspace(tips, values=share, label="mean share of the inputs' range")
+    axes[0].figure.suptitle(title)
+    axes[0].figure.savefig(Path(path), dpi=200)
