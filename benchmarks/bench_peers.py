@@ -1,20 +1,22 @@
-"""vsr_jax and SoRoMoX on one loaded scene, in one process: B1's arm and helical thread under gravity and a dead tip force.
+"""vsr_jax and its peers on the same scenes, in one process: an arm with a parallel thread, with a helical one, and that with loads.
 
-    pip install ".[bench]" && python benchmarks/bench_peers.py [--json FILE] [--formulations] [--rounds N]
+    pip install ".[bench]" && python benchmarks/bench_peers.py [--scenes A1 B1 loaded] [--slow] [--json FILE] [--plot FILE]
 
 1,024 tensions drawn uniformly from [-15, 0] N (the sign of the paper: negative pulls), float64, each shape solved on its own from a
-cold start. Tip errors are distances to vsr_jax at 96 steps of order 6, which is itself held against an independent solution at
--5 N. "gradient" is the derivative of the tip's height, summed over the batch, by the radius, angle and phase of the helix. All
-functions are compiled first and then timed in rounds, one after another, so that a busy machine is busy for both tools alike.
+cold start. Tip errors are distances to vsr_jax at 96 steps of order 6, which is itself held against an independent solution of the
+loaded scene. "gradient" is the derivative of the tip's height, summed over the batch, by the radius, angle and phase of the thread.
+All functions are compiled first and then timed in rounds, one after another, so that a busy machine is busy for both tools alike.
 
-How SoRoMoX is used, which has no static solver, is told in `peer_soromox`. `--formulations` times the ways that were tried
-against each other.
+How SoRoMoX is used, which has no static solver, is told in `peer_soromox`. `--slow` adds single solves, at -5 N, by SciPy's
+`solve_bvp` (`peer_scipy`) and by PyElastica's dynamics (`peer_elastica`, arms without loads). `--formulations` times the ways in which
+SoRoMoX was tried on the loaded scene.
 """
 
 import argparse
 import importlib.metadata
 import json
 import sys
+import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -24,6 +26,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.figure import Figure
+from peer_scenes import CASES, Case, our_scene
 
 import vsr_jax as vsr
 from vsr_jax.timing import Timed, machine, take_turns
@@ -31,28 +35,7 @@ from vsr_jax.timing import Timed, machine, take_turns
 BATCH = 1024
 SINGLES = 5
 TRUTH = (96, 6)
-OURS = [(6, 6), (8, 6), (12, 6), (16, 6), (20, 6), (26, 6)]
-THEIRS = [(6, 12, 1e-3), (8, 16, 1e-4), (12, 24, 1e-4), (16, 48, 1e-5), (20, 64, 1e-6), (24, 96, 1e-6)]
-SCENE: dict[str, Any] = {
-    "length": 0.75,
-    "radius": 0.01,
-    "young": 5.93e5,
-    "shear": 2.0e5,
-    "density": 120.0,
-    "helix": {"radius": 0.005, "angle": 1.529, "phase": 0.0},
-    "gravity": (0.0, 0.0, -9.81),
-    "tip_force": (0.0, 0.02, 0.02),
-}
-# Tip at -5 N by SciPy: cross-section balance by Newton, pose and moment by DOP853, base wrench by shooting with load steps.
-REFERENCE_TAU, REFERENCE_TIP = -5.0, (0.23267292337207685, 0.20950543772381253, -0.5284293230120489)
-
-
-def our_scene() -> vsr.Scene:
-    """The scene in vsr_jax."""
-    material = vsr.Material(SCENE["young"], shear=SCENE["shear"], density=SCENE["density"])
-    arm = vsr.Rod(SCENE["length"], vsr.Circular(SCENE["radius"]), material)
-    loads = [vsr.Gravity(SCENE["gravity"]), vsr.TipWrench(force=SCENE["tip_force"], frame="world")]
-    return vsr.Scene(arm, [vsr.Thread(vsr.Helix(**SCENE["helix"]))], loads=loads).astype("float64")
+COLOURS = {"vsr_jax": "#0072B2", "SoRoMoX": "#D55E00", "SoRoMoX, Newton": "#E69F00"}
 
 
 def our_tips(model: vsr.StrainDependent, scene: vsr.Scene, taus: jax.Array) -> jax.Array:
@@ -60,9 +43,9 @@ def our_tips(model: vsr.StrainDependent, scene: vsr.Scene, taus: jax.Array) -> j
     return jax.vmap(lambda tau: vsr.solve(scene, tau, model=model).tip[:3, 3])(taus)
 
 
-def our_jobs(steps: int, order: int, taus: jax.Array) -> tuple[str, dict[str, Timed]]:
+def our_jobs(case: Case, steps: int, order: int, taus: jax.Array) -> tuple[str, dict[str, Timed]]:
     """Name and compiled functions of one resolution of vsr_jax."""
-    scene, model = our_scene(), vsr.StrainDependent(steps, order)
+    scene, model = our_scene(case.numbers), vsr.StrainDependent(steps, order)
     tips = partial(our_tips, model)
 
     def single(scene: vsr.Scene, tau: jax.Array) -> jax.Array:
@@ -78,19 +61,20 @@ def our_jobs(steps: int, order: int, taus: jax.Array) -> tuple[str, dict[str, Ti
     }
 
 
-def their_jobs(peer: Any, setting: tuple[int, int, float], taus: jax.Array) -> tuple[str, dict[str, Timed]]:
+def their_jobs(peer: Any, case: Case, setting: tuple, taus: jax.Array) -> tuple[str, dict[str, Timed]]:
     """Name and compiled functions of one setting of SoRoMoX."""
     chosen = peer.Setting(*setting)
-    arm, path = peer.build(chosen, SCENE)
+    arm, path = peer.build(chosen, case.numbers)
+    solve = peer.UNLOADED[chosen.way]
 
     def single(arm: Any, path: Any, tau: jax.Array) -> jax.Array:
-        return peer.tip(arm, peer.equilibrium(arm, path, tau, chosen.tolerance))
+        return peer.tip(arm, solve(arm, path, tau, chosen.tolerance))
 
     def tips(arm: Any, path: Any, taus: jax.Array) -> jax.Array:
         return jax.vmap(partial(single, arm, path))(taus)
 
     def gradient(arm: Any, path: Any, taus: jax.Array) -> Any:
-        each = jax.vmap(lambda tau: peer.height_gradient(arm, path, tau, chosen.tolerance))(taus)
+        each = jax.vmap(lambda tau: peer.height_gradient(arm, path, tau, chosen.tolerance, solve))(taus)
         return jax.tree.map(lambda leaf: jnp.sum(leaf, 0), each)
 
     return str(chosen), {
@@ -163,8 +147,8 @@ def print_pairs(pairs: list[dict[str, Any]]) -> None:
 
 def formulations(peer: Any, taus: jax.Array, truth: np.ndarray, rounds: int, lanes: int = 64) -> list[dict[str, Any]]:
     """Rows for the ways of posing the statics to SoRoMoX, at one setting, in a small batch."""
-    chosen = peer.Setting(*THEIRS[1])
-    arm, path = peer.build(chosen, SCENE)
+    chosen = peer.Setting(*CASES["loaded"].theirs[1])
+    arm, path = peer.build(chosen, CASES["loaded"].numbers)
     rows = []
     print(f"\nSoRoMoX's formulations, {chosen}, {lanes} in a batch:\n")
     print("| formulation | tip error max [m] | median | us a shape | compile [s] |")
@@ -184,11 +168,34 @@ def formulations(peer: Any, taus: jax.Array, truth: np.ndarray, rounds: int, lan
     return rows
 
 
-def truths(taus: jax.Array) -> tuple[np.ndarray, float]:
+def truths(case: Case, taus: jax.Array) -> tuple[np.ndarray, float | None]:
     """Tips [m] at all tensions by vsr_jax at high resolution, and how far its tip is from the independent one [m]."""
     tips = jax.jit(partial(our_tips, vsr.StrainDependent(*TRUTH)))
-    found = np.asarray(tips(our_scene(), jnp.append(taus, jnp.array([[REFERENCE_TAU]]), axis=0)))
-    return found[:-1], float(np.linalg.norm(found[-1] - np.array(REFERENCE_TIP)))
+    found = np.asarray(tips(our_scene(case.numbers), jnp.append(taus, jnp.array([[case.tension]]), axis=0)))
+    return found, None if case.tip is None else float(np.linalg.norm(found[-1] - np.array(case.tip)))
+
+
+def slow_peers(name: str, case: Case, truth: np.ndarray) -> list[dict[str, Any]]:
+    """Single solves by SciPy, and by PyElastica for an arm without loads: seconds, and distance of the tip [m]."""
+    from peer_scipy import Arm
+
+    arm = Arm(case.numbers)
+    ways: dict[tuple[str, str], Callable] = {
+        ("SciPy solve_bvp", f"tol {tol:g}"): partial(arm.tip, case.tension, tol) for tol in (1e-4, 1e-6)
+    }
+    if case.numbers["gravity"] is None:
+        import peer_elastica
+
+        for elements in (20, 40):
+            key = "PyElastica dynamics", f"{elements} elements, 15 s"
+            ways[key] = partial(peer_elastica.tip, case.numbers, case.tension, elements, 15.0)
+    rows = []
+    for (tool, setting), way in ways.items():
+        start = time.perf_counter()
+        error = float(np.linalg.norm(way() - truth))
+        rows.append({"scene": name, "tool": tool, "setting": setting, "seconds": time.perf_counter() - start, "tip_error": error})
+        print(f"{tool}, {setting}: {rows[-1]['seconds']:.2f} s for one shape, tip error {error:.1e} m", flush=True)
+    return rows
 
 
 def load_peer() -> Any:
@@ -201,32 +208,67 @@ def load_peer() -> Any:
     return peer_soromox
 
 
+def run(name: str, peer: Any, taus: jax.Array, rounds: int, slow: bool) -> dict[str, Any]:
+    """Tables of one scene."""
+    case = CASES[name]
+    truth, miss = truths(case, taus)
+    print(f"\n## {name}: {case.about}\n")
+    if miss is not None:
+        print(f"vsr_jax at {TRUTH[0]} steps of order {TRUTH[1]} is {miss:.1e} m from the independent tip at {case.tension} N\n", flush=True)
+    jobs = [("SoRoMoX", *their_jobs(peer, case, setting, taus)) for setting in case.theirs]
+    jobs += [("vsr_jax", *our_jobs(case, *resolution, taus)) for resolution in case.ours]
+    rows = measure(jobs, truth[:-1], rounds)
+    print_rows(rows)
+    pairs = compare(rows)
+    print_pairs(pairs)
+    report = {"about": case.about, "truth_error": miss, "rows": rows, "pairs": pairs}
+    return report | ({"slow": slow_peers(name, case, truth[-1])} if slow else {})
+
+
+def draw(report: dict[str, Any], path: str) -> None:
+    """Shapes a second over tip error, a panel for each scene."""
+    scenes = report["scenes"]
+    figure = Figure(figsize=(4 * len(scenes), 3.8), layout="constrained")
+    for ax, (name, found) in zip(np.atleast_1d(figure.subplots(1, len(scenes))), scenes.items(), strict=True):
+        for tool, colour in COLOURS.items():
+            newton = tool.endswith("Newton")
+            rows = [row for row in found["rows"] if tool.startswith(row["tool"]) and ("Newton" in row["setting"]) == newton]
+            rows.sort(key=lambda row: row["tip_error_max"])
+            if rows:
+                x = [max(row["tip_error_max"], 1e-16) for row in rows]
+                ax.plot(x, [1e6 * BATCH / row["batch"]["median_us"] for row in rows], "o-", color=colour, label=tool)
+        ax.set(xscale="log", yscale="log", xlabel="largest tip error [m]", ylabel="shapes a second", title=name)
+        ax.grid(alpha=0.3)
+        ax.legend()
+    figure.savefig(path, dpi=150)
+
+
 def main() -> None:
     """Run the benchmark and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", type=Path, help="write the figures here too")
-    parser.add_argument("--formulations", action="store_true", help="time the ways of posing the statics to SoRoMoX as well")
+    parser.add_argument("--scenes", nargs="+", choices=tuple(CASES), default=tuple(CASES), help="which of them (default: all)")
+    parser.add_argument("--slow", action="store_true", help="single solves by SciPy and PyElastica too")
+    parser.add_argument("--formulations", action="store_true", help="time the ways of posing the loaded statics to SoRoMoX as well")
     parser.add_argument("--rounds", type=int, default=5, help="how often each function is timed (5)")
+    parser.add_argument("--json", type=Path, help="write the figures here too")
+    parser.add_argument("--plot", metavar="FILE", help="draw them")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     peer = load_peer()
     versions = {name: importlib.metadata.version(name) for name in ("jax", "soromox")} | {"vsr_jax": vsr.__version__}
     print(f"{machine()}, {', '.join(f'{name} {number}' for name, number in versions.items())}")
     taus = jnp.asarray(np.random.default_rng(0).uniform(-15, 0, (BATCH, 1)))
-    truth, miss = truths(taus)
-    print(f"vsr_jax at {TRUTH[0]} steps of order {TRUTH[1]} is {miss:.1e} m from the independent tip at {REFERENCE_TAU} N\n", flush=True)
-    jobs = [("SoRoMoX", *their_jobs(peer, setting, taus)) for setting in THEIRS]
-    jobs += [("vsr_jax", *our_jobs(*resolution, taus)) for resolution in OURS]
-    rows = measure(jobs, truth, options.rounds)
-    print_rows(rows)
-    pairs = compare(rows)
-    print_pairs(pairs)
-    report: dict[str, Any] = {"machine": machine(), "versions": versions, "truth_error": miss, "rows": rows, "pairs": pairs}
+    report: dict[str, Any] = {"machine": machine(), "versions": versions, "scenes": {}}
+    for name in options.scenes:
+        report["scenes"][name] = run(name, peer, taus, options.rounds, options.slow)
+        jax.clear_caches()
     if options.formulations:
-        report["formulations"] = formulations(peer, taus, truth, options.rounds)
+        report["formulations"] = formulations(peer, taus, truths(CASES["loaded"], taus)[0][:-1], options.rounds)
     if options.json:
         options.json.parent.mkdir(parents=True, exist_ok=True)
         options.json.write_text(json.dumps(report, indent=1) + "\n")
+    if options.plot:
+        draw(report, options.plot)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
-"""SoRoMoX's side of bench_peers: the loaded arm B1 as the minimum of an energy put together from SoRoMoX's own functions.
+"""SoRoMoX's side of bench_peers: an arm as the minimum of an energy put together from SoRoMoX's own functions.
 
-SoRoMoX (0.5) has no static solver. Its authors' scripts solve K q + G(q) = A(q) u by Newton's method from q = 0; on this arm, which
-is far softer than its loads, that diverges. `FORMULATIONS` keeps what else was tried. The fastest by far, and the one used:
+SoRoMoX (0.5) has no static solver. Its authors' scripts solve K q + G(q) = A(q) u by Newton's method from q = 0; that is one of the
+rows for arms without loads, and diverges on the loaded arm B1, which is far softer than its loads. `FORMULATIONS` keeps what else
+was tried. The fastest by far, and the one used:
 
 - one energy in place of the assembled forces: elastic energy, plus tension times path length, minus the work of the loads. Its
   reverse-mode gradient costs about three runs of the kinematics, the forces a recurrence of Jacobians;
@@ -24,6 +25,7 @@ import jax
 import jax.numpy as jnp
 import optimistix  # pyright: ignore[reportMissingImports]
 from jax import Array
+from peer_scenes import NEWTON
 from soromox.actuation import ThreadlikeActuator, ThreadlikeRouting  # pyright: ignore[reportMissingImports]
 from soromox.actuation.threadlike import BaseThreadlikeRoutingParams  # pyright: ignore[reportMissingImports]
 from soromox.systems.components import JointSpec, LinkSpec  # pyright: ignore[reportMissingImports]
@@ -31,16 +33,22 @@ from soromox.systems.gvs import GVS, GVSSegment, StrainBasisSpec  # pyright: ign
 from soromox.utils.geometry.poses import spatial_mounting_pose  # pyright: ignore[reportMissingImports]
 from soromox.utils.lie_algebra import se3  # pyright: ignore[reportMissingImports]
 
+BFGS = "energy, BFGS, cells side by side (used)"
+
 
 class Setting(NamedTuple):
-    """Legendre order of all six strains, Gauss points along the arm, and the step, in whitened coordinates, that ends BFGS."""
+    """Order of the basis of all six strains, Gauss points along the arm, the step, in whitened coordinates, that ends the iteration,
+    the family of the basis, and how the balance is found: a key of `FORMULATIONS`."""
 
     order: int
     points: int
     tolerance: float
+    family: str = "legendre"
+    way: str = BFGS
 
     def __str__(self) -> str:
-        return f"order {self.order}, {self.points} points, step < {self.tolerance:g}"
+        way = "" if self.way == BFGS else ", Newton"
+        return f"{self.family} {self.order}, {self.points} points, step < {self.tolerance:g}{way}"
 
 
 class HelixPath(BaseThreadlikeRoutingParams):
@@ -65,10 +73,11 @@ class HelixPath(BaseThreadlikeRoutingParams):
 
 
 class Arm(NamedTuple):
-    """A robot of SoRoMoX, the force on its tip [N], and the matrix from whitened coordinates to the robot's own."""
+    """A robot of SoRoMoX, the force on its tip [N], None for an arm without loads, and the matrix from whitened coordinates to
+    the robot's own."""
 
     robot: Any
-    force: Array
+    force: Array | None
     whiten: Array
 
 
@@ -99,12 +108,13 @@ def build(setting: Setting, scene: dict[str, Any]) -> tuple[Arm, HelixPath]:
         young_modulus=scene["young"],
         shear_modulus=scene["shear"],
     )
-    basis = StrainBasisSpec(type="legendre", strain_selector=[1] * 6, basis_order=setting.order)
+    basis = StrainBasisSpec(type=setting.family, strain_selector=[1] * 6, basis_order=setting.order)
     segment = GVSSegment(link=link, joint=JointSpec(type="fixed"), basis=basis, num_gauss_points=setting.points)
     mounting = spatial_mounting_pose("horizontal")
-    robot = GVS.from_segments([segment], gravity=jnp.array(scene["gravity"]), base_pose=mounting, actuators=tendon(path))
+    gravity = jnp.array(scene["gravity"] or (0.0, 0.0, 0.0))
+    robot = GVS.from_segments([segment], gravity=gravity, base_pose=mounting, actuators=tendon(path))
     whiten = jnp.linalg.inv(jnp.linalg.cholesky(robot.stiffness_matrix())).T
-    return Arm(robot, jnp.array(scene["tip_force"]), whiten), path
+    return Arm(robot, None if scene["tip_force"] is None else jnp.array(scene["tip_force"]), whiten), path
 
 
 def own_kinematics(robot: Any, q: Array) -> Array:
@@ -131,10 +141,12 @@ def tip(arm: Arm, z: Array) -> Array:
 def energy(arm: Arm, path: HelixPath, tau: Array, z: Array, share: Any = 1.0, kinematics: Callable = cells) -> Array:
     """Energy [J] at whitened coordinates z under the signed thread force tau [N], shape (1,), and a share of the loads."""
     robot, q = arm.robot, arm.whiten @ z
+    own = robot.elastic_energy(q) + tau @ tendon(path).coordinates(robot, q)
+    if arm.force is None:
+        return own  # needs no kinematics
     positions = kinematics(robot, q)[:, :3, 3]
     masses = robot.inner_weighted_mass_diagonals[0, :, 3]
-    work = masses @ (positions[:-1] @ robot.g[3:]) + positions[-1] @ arm.force
-    return robot.elastic_energy(q) + tau @ tendon(path).coordinates(robot, q) - share * work
+    return own - share * (masses @ (positions[:-1] @ robot.g[3:]) + positions[-1] @ arm.force)
 
 
 def slope(arm: Arm, path: HelixPath, tau: Array, z: Array, share: Any = 1.0) -> Array:
@@ -172,9 +184,9 @@ def equilibrium(arm: Arm, path: HelixPath, tau: Array, tolerance: float, kinemat
     return minimise(lambda z: evaluate(arm, path, tau, z, 1.0, kinematics), jnp.zeros(len(arm.whiten)), tolerance)
 
 
-def height_gradient(arm: Arm, path: HelixPath, tau: Array, tolerance: float) -> HelixPath:
+def height_gradient(arm: Arm, path: HelixPath, tau: Array, tolerance: float, solve: Callable = equilibrium) -> HelixPath:
     """Derivative of the tip's height by the path's numbers: implicit, the adjoint by conjugate gradients on Hessian products."""
-    z = equilibrium(arm, path, tau, tolerance)
+    z = solve(arm, path, tau, tolerance)
     right = jax.grad(lambda z: tip(arm, z)[2])(z)
     _, hessian = jax.linearize(partial(slope, arm, path, tau), z)
     adjoint, _ = jax.scipy.sparse.linalg.cg(hessian, right, tol=1e-4)
@@ -205,10 +217,27 @@ def _optimistix(arm: Arm, path: HelixPath, tau: Array, tolerance: float) -> Arra
     return optimistix.minimise(lambda z, _: energy(arm, path, tau, z), solver, rest, max_steps=100, throw=False).value
 
 
+def _newton_from_rest(arm: Arm, path: HelixPath, tau: Array, tolerance: float, max_steps: int = 30) -> Array:
+    """K q = A(q) u as SoRoMoX's authors write it, by Newton's method until a step is shorter than the tolerance; no loads."""
+
+    def residual(z: Array) -> Array:
+        q = arm.whiten @ z
+        return arm.whiten.T @ (arm.robot.elastic_force(q) - arm.robot.actuation_force(q, -tau))
+
+    def step(state: tuple) -> tuple:
+        z, _, count = state
+        move = jnp.linalg.solve(jax.jacfwd(residual)(z), residual(z))
+        return z - move, jnp.linalg.norm(move), count + 1
+
+    start = jnp.zeros(len(arm.whiten)), jnp.array(jnp.inf), 0
+    return jax.lax.while_loop(lambda state: (state[1] > tolerance) & (state[2] < max_steps), step, start)[0]
+
+
 FORMULATIONS: dict[str, Callable] = {
     "forces, Newton by jacfwd, 8 load steps": partial(_newton, _forces),
     "energy, Newton by jacfwd, 8 load steps": partial(_newton, slope),
     "energy, optimistix.BFGS": _optimistix,
     "energy, BFGS, SoRoMoX's own kinematics": partial(equilibrium, kinematics=own_kinematics),
-    "energy, BFGS, cells side by side (used)": equilibrium,
+    BFGS: equilibrium,
 }
+UNLOADED: dict[str, Callable] = {BFGS: equilibrium, NEWTON: _newton_from_rest}

@@ -12,7 +12,7 @@ LAYERS = """
 _types _check component implicit se3 quadrature profile section material routing actuator rod load scene newton balance kinematics
 resolution
 cable reaction elimination friction coupled coupled_tangent coupled_solve basis model galerkin discrete
-strain_dependent shooting continuum stability equilibrium solve health continuation archive sweep
+strain_dependent shooting continuum stability equilibrium solve health continuation archive parallel sweep
 scenefile plot paper paper_figures reproduce report timing effects cli_common cli_scene cli_sweep cli_studies cli
 """.split()  # noqa: SIM905
 

@@ -148,6 +148,7 @@ def test_another_sweep_is_refused(tmp_path):
         ({"scene": "arm"}, "sweep.scene: got 'arm', need a Scene"),
         ({"outputs": "height"}, "sweep.outputs: got 'height', need some of tip, lengths"),
         ({"outputs": lambda eq: eq.tip}, "need arrays by name"),
+        ({"outputs": lambda eq: {"status": eq.status}}, "need other names than status"),
         ({"chunk": 0}, "sweep.chunk: got 0, need an integer >= 1"),
     ],
 )
@@ -211,7 +212,7 @@ def test_a_killed_sweep_goes_on_with_the_same_result(tmp_path):
     left = np.asarray(zarr.open_group(path, mode="r")["status"])
     assert 0 < np.count_nonzero(left == -1) < len(many)
     result = vsr.sweep(arm(0.006), many, model=MODEL, out=path, progress=False)
-    whole = vsr.sweep(arm(0.006), many, model=MODEL, progress=False)
+    whole = vsr.sweep(arm(0.006), many, model=MODEL, chunk=200, progress=False)
     np.testing.assert_array_equal(result["tip"][:], whole["tip"])
     np.testing.assert_array_equal(result.status[:], whole.status)
 

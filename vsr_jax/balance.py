@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .component import Matrix, Vector, add, cholesky, cholesky_solve, dot, multiply, scale, subtract
+from .component import Matrix, Vector, add, cholesky, cholesky_solve, dot, multiply, scale, single, subtract
 from .implicit import change_of, instantiated, no_derivative
 from .newton import Evaluation, newton
 from .routing import Path, thread_tangent
@@ -125,9 +125,14 @@ def with_locked(xi: Vector, locked: Vector, free: tuple[int, ...]) -> Vector:
 
 
 def newton_step(xi: Vector, sections: CrossSections, tau: Vector, reaction: Vector | None, free: tuple[int, ...]) -> tuple[Vector, Vector]:
-    """Residual $r$ of the free strains and the step $H^{-1} r$ to subtract, whose last is NaN where $H$ is not positive definite."""
+    """Residual $r$ of the free strains and the step $H^{-1} r$ to subtract, whose last is NaN where $H$ is not positive definite.
+
+    The tangent is factored in single precision, at half the cost: of a small step only its first digits matter.
+    """
     r = chosen(residual(xi, sections, tau, reaction), free)
-    return r, cholesky_solve(cholesky(chosen_rows(tangent(xi, sections, tau), free)), r)
+    factor = cholesky(chosen_rows(tangent(*single((xi, sections, tau))), free))
+    step = cholesky_solve(factor, single(r))
+    return r, tuple(s.astype(x.dtype) for s, x in zip(step, r, strict=True))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(3,))

@@ -1,0 +1,260 @@
+"""How fast and how large sweeps are: samples, nodes, threads, sections, loads, devices; the machine's limit; a million shapes, killed.
+
+    pip install ".[sweep]" && python benchmarks/bench_sweep.py [--json FILE] [--plot FILE] [--million]
+
+The arm is the paper's B1, a helical thread, at 16 steps of order 6, with tensions from [0, 15] N, unless a row says otherwise. All
+rates are those of `vsr.sweep`, copies to and from the devices included, compiled before; medians of several runs in turn, with
+the fastest and the slowest. Each core of the CPU is a device, as `vsr-jax sweep` has it, unless a row says otherwise.
+
+`--million` sweeps a million shapes to disk in a process of its own, kills that at a random moment, lets another go on, and
+compares what is on disk with a sweep that nobody killed.
+"""
+
+import argparse
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+if "XLA_FLAGS" not in os.environ:
+    os.environ["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={len(os.sched_getaffinity(0))}"
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from matplotlib.figure import Figure
+
+import vsr_jax as vsr
+from vsr_jax.balance import newton_step
+from vsr_jax.timing import Timed, machine
+
+SAMPLES = 16_384
+STEPS = 16
+ROUNDS = 5
+MILLION = 1_000_000
+CHILD = """
+import re, sys
+from pathlib import Path
+import jax; jax.config.update("jax_enable_x64", True)
+import bench_sweep as b
+path, samples = sys.argv[1], int(sys.argv[2])
+import vsr_jax as vsr
+result = vsr.sweep(b.helix(), b.tensions(samples), model=vsr.StrainDependent(b.STEPS), out=path, progress=False)
+print(1024 * int(re.search(r"VmHWM:\\s*(\\d+)", Path("/proc/self/status").read_text())[1]))
+"""
+
+
+def rod(sections: int = 1) -> vsr.Rod:
+    """The paper's cylinder, in pieces that differ by a tenth in radius."""
+    radii = [0.01 * (1 + 0.1 * (i % 2)) for i in range(sections)]
+    ends = [0.75 * (i + 1) / sections for i in range(sections - 1)]
+    section = vsr.Circular(0.01) if sections == 1 else vsr.Circular(vsr.Piecewise(ends, radii))
+    return vsr.Rod(0.75, section, vsr.Material(5.93e5, shear=2.0e5, density=120.0))
+
+
+def helix(threads: int = 1, sections: int = 1, loads: tuple = ()) -> vsr.Scene:
+    """An arm with helical tendons."""
+    laid = [vsr.Tendon(vsr.Helix(0.005, 1.529, phase=2 * np.pi * i / threads)) for i in range(threads)]
+    return vsr.Scene(rod(sections), laid, list(loads)).astype("float64")
+
+
+def tensions(samples: int, threads: int = 1, dtype: str = "float64") -> np.ndarray:
+    """Tensions [N] from [0, 15] in all."""
+    return np.random.default_rng(0).uniform(0, 15 / threads, (samples, threads)).astype(dtype)
+
+
+def place(eq: vsr.Equilibrium) -> dict[str, Any]:
+    """Where the tip is: what a workspace needs."""
+    return {"tip": eq.tip[:3, 3]}
+
+
+def job(scene: vsr.Scene, inputs: np.ndarray, steps: int = STEPS, devices: Any = None) -> Callable[[], Any]:
+    """A sweep ready to run, compiled."""
+
+    def run() -> Any:
+        return vsr.sweep(scene, inputs, outputs=place, model=vsr.StrainDependent(steps), devices=devices, progress=False)
+
+    run()
+    return run
+
+
+def rates(jobs: dict[str, tuple[Callable, int]], rounds: int = ROUNDS) -> list[dict[str, Any]]:
+    """Shapes a second of each job, all in turn."""
+    seconds: dict[str, list[float]] = {name: [] for name in jobs}
+    for _ in range(rounds):
+        for name, (run, _) in jobs.items():
+            start = time.perf_counter()
+            run()
+            seconds[name].append(time.perf_counter() - start)
+    rows = []
+    for name, (_, samples) in jobs.items():
+        low, median, high = (samples / x for x in (max(seconds[name]), np.median(seconds[name]), min(seconds[name])))
+        print(f"{name:34s} {median:>10,.0f} shapes/s ({low:,.0f}-{high:,.0f})", flush=True)
+        rows.append({"name": name, "samples": samples, "per_s": float(median), "low": float(low), "high": float(high)})
+    return rows
+
+
+def studies() -> dict[str, list[dict[str, Any]]]:
+    """Rates by what is varied."""
+    gravity, many = (vsr.Gravity(),), tensions(SAMPLES)
+    few = 2048
+    by = {"samples": {f"{n:,} samples": (job(helix(), tensions(n)), n) for n in (1, 10, 100, 1_000, 10_000, 100_000, MILLION)}}
+    by["nodes"] = {f"{3 * n} nodes": (job(helix(), many, n), SAMPLES) for n in (2, 4, 8, 16, 32, 64)}
+    by["threads"] = {f"{n} threads": (job(helix(n), tensions(SAMPLES, n)), SAMPLES) for n in (1, 2, 3, 4, 6)}
+    by["sections"] = {f"{n} sections": (job(helix(1, n), many), SAMPLES) for n in (1, 2, 4, 8)}
+    by["precision and loads"] = {
+        "float64": (job(helix(), many), SAMPLES),
+        "float32": (job(helix().astype("float32"), tensions(SAMPLES, dtype="float32")), SAMPLES),
+        "gravity, float64": (job(helix(loads=gravity), tensions(few)), few),
+        "gravity, float32": (job(helix(loads=gravity).astype("float32"), tensions(few, dtype="float32")), few),
+    }
+    devices = jax.local_devices()
+    by["devices"] = {f"{n} devices": (job(helix(), many, devices=devices[:n]), SAMPLES) for n in range(1, len(devices) + 1)}
+    found = {}
+    for name, jobs in by.items():
+        print(f"\nby {name}")
+        found[name] = rates(jobs, 3 if name == "samples" else ROUNDS)
+    return found
+
+
+def limit(lanes: int = 512) -> dict[str, float]:
+    """Floating-point operations: of the machine in a second, at most, and of a shape.
+
+    The operations of a shape are those of one Newton step at all nodes times the steps taken, and those of all the rest, as XLA
+    counts them: a division, a root and a sine count as one each, which a processor takes ten times as long for.
+    """
+    machine_rate = _most_operations()
+    scene, model, inputs = helix(), vsr.StrainDependent(STEPS), jnp.asarray(tensions(lanes))
+
+    def whole(inputs: jax.Array) -> Any:
+        return jax.vmap(lambda u: vsr.solve(scene, u, model=model).tip[:3, 3])(inputs)
+
+    def step(inputs: jax.Array) -> Any:
+        def one(u: jax.Array) -> Any:
+            sections = scene.sections(model.grid(scene).X)
+            return newton_step(sections.rest, sections, sections.carry(scene.forces(u)), None, scene.free)
+
+        return jax.vmap(one)(inputs)
+
+    counted = [(Timed(f, inputs).operations or 0) / lanes for f in (whole, step)]
+    taken = float(jnp.mean(jax.vmap(lambda u: vsr.solve(scene, u, model=model).steps)(inputs)))
+    operations = counted[0] + (taken - 1) * counted[1]
+    return {"machine_flops": machine_rate, "newton_steps": taken, "operations_a_shape": operations}
+
+
+def _most_operations(chains: int = 4, depth: int = 32, size: int = 65_536, times: int = 200) -> float:
+    """Operations a second of chains of fused multiply-adds that stay in the registers, on all devices at once."""
+
+    def body(_: int, x: jax.Array) -> jax.Array:
+        y = [x * (1 + 1e-3 * i) for i in range(chains)]
+        for _ in range(depth):
+            y = [0.999 * value + x for value in y]
+        return 1e-3 * sum(y[1:], y[0])
+
+    def chain(x: jax.Array) -> jax.Array:
+        return jax.lax.fori_loop(0, times, body, x)
+
+    mesh = Mesh(np.array(jax.local_devices()), ("parts",))
+    spread = jax.jit(jax.shard_map(chain, mesh=mesh, in_specs=PartitionSpec("parts"), out_specs=PartitionSpec("parts"), check_vma=False))
+    x = jnp.linspace(0.9, 1.0, size * mesh.devices.size)
+    return 2 * chains * depth * times * x.size / _seconds(spread, jax.device_put(x, NamedSharding(mesh, PartitionSpec("parts"))))
+
+
+def _seconds(function: Callable, *args: Any, rounds: int = 9) -> float:
+    jax.block_until_ready(function(*args))
+    times = []
+    for _ in range(rounds):
+        start = time.perf_counter()
+        jax.block_until_ready(function(*args))
+        times.append(time.perf_counter() - start)
+    return float(np.median(times))
+
+
+def million(samples: int = MILLION) -> dict[str, Any]:
+    """A sweep to disk that is killed and goes on, against one that is not."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
+
+    def start(path: Path) -> subprocess.Popen:
+        arguments = [sys.executable, "-c", CHILD, str(path), str(samples)]
+        return subprocess.Popen(arguments, env=environment, stdout=subprocess.PIPE, text=True)
+
+    def finish(path: Path) -> tuple[float, int]:
+        begun = time.perf_counter()
+        out, _ = (process := start(path)).communicate()
+        if process.returncode:
+            raise RuntimeError(f"the sweep to {path} ended with {process.returncode}")
+        return time.perf_counter() - begun, int(out)
+
+    import zarr
+
+    with tempfile.TemporaryDirectory() as folder:
+        whole, killed = Path(folder) / "whole.zarr", Path(folder) / "killed.zarr"
+        seconds, memory = finish(whole)
+        process = start(killed)
+        time.sleep(seconds * np.random.default_rng().uniform(0.3, 0.9))
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        done = int(np.count_nonzero(np.asarray(zarr.open_group(killed, mode="r")["status"]) >= 0))
+        rest, _ = finish(killed)
+        groups = [zarr.open_group(path, mode="r") for path in (whole, killed)]
+        same = all(np.asarray(groups[0][name]).tobytes() == np.asarray(groups[1][name]).tobytes() for name in ("tip", "status"))
+    row = {"samples": samples, "seconds": seconds, "memory_bytes": memory, "done_when_killed": done, "rest_s": rest, "identical": same}
+    print(
+        f"\n{samples:,} shapes to disk: {seconds:.1f} s with start and compiling, {memory / 2**30:.2f} GiB at most; killed after {done:,}"
+    )
+    print(f"the rest took {rest:.1f} s; what is on disk is {'the same to the bit' if same else 'NOT the same'}")
+    return row
+
+
+def draw(found: dict[str, list[dict[str, Any]]], path: str) -> None:
+    """A panel for each study."""
+    figure = Figure(figsize=(11, 6), layout="constrained")
+    for ax, (name, rows) in zip(figure.subplots(2, 3).flat, found.items(), strict=True):
+        names = [row["name"].removesuffix(f" {name}") for row in rows]
+        rate = np.array([[row[key] for key in ("per_s", "low", "high")] for row in rows]).T
+        spread = np.abs(rate[1:] - rate[0])
+        if name in ("samples", "nodes"):
+            ax.errorbar([float(text.replace(",", "")) for text in names], rate[0], spread, marker="o", capsize=3, color="#0072B2")
+            ax.set(xscale="log", yscale="log")
+        else:
+            ax.bar(names, rate[0], yerr=spread, color="#0072B2", capsize=3)
+            ax.tick_params(axis="x", labelrotation=20 if name.startswith("precision") else 0)
+        ax.set(xlabel=name, ylabel="shapes a second")
+        ax.grid(axis="y", alpha=0.3)
+    figure.savefig(path, dpi=150)
+
+
+def main() -> None:
+    """All studies, the table, and what is asked for besides."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path, help="write the figures here too")
+    parser.add_argument("--plot", metavar="FILE", help="draw them")
+    parser.add_argument("--million", action="store_true", help="a million shapes to disk, killed once")
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    report: dict[str, Any] = {"machine": machine(), "jax": jax.__version__, "devices": jax.local_device_count()}
+    print(f"{report['machine']}, jax {report['jax']}, {report['devices']} devices")
+    report["limit"] = limit()
+    report["rates"] = studies()
+    fastest = max(row["per_s"] for row in report["rates"]["samples"])
+    share = fastest * report["limit"]["operations_a_shape"] / report["limit"]["machine_flops"]
+    report["limit"]["share"] = share
+    print("\n{operations_a_shape:,.0f} operations a shape, {machine_flops:.2e} a second at most".format(**report["limit"]), end="")
+    print(f": the fastest sweep does {share:.0%} of that")
+    if options.million:
+        report["million"] = million()
+    if options.json:
+        options.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    if options.plot:
+        draw(report["rates"], options.plot)
+
+
+if __name__ == "__main__":
+    main()
