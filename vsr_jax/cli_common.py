@@ -53,4 +53,5 @@ def one_device_a_core() -> None:
 
     Devices work on samples of their own, where threads within one operation wait for each other.
     """
-    os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count={len(os.sched_getaffinity(0))}")
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count={cores}")
