@@ -22,9 +22,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-if "XLA_FLAGS" not in os.environ:
-    os.environ["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={len(os.sched_getaffinity(0))}"
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -33,7 +30,10 @@ from matplotlib.figure import Figure
 
 import vsr_jax as vsr
 from vsr_jax.balance import newton_step
-from vsr_jax.timing import Timed, machine
+from vsr_jax.cli_common import one_device_a_core
+from vsr_jax.timing import Timed, machine, take_turns
+
+one_device_a_core()
 
 SAMPLES = 16_384
 STEPS = 16
@@ -164,17 +164,9 @@ def _most_operations(chains: int = 4, depth: int = 32, size: int = 65_536, times
     mesh = Mesh(np.array(jax.local_devices()), ("parts",))
     spread = jax.jit(jax.shard_map(chain, mesh=mesh, in_specs=PartitionSpec("parts"), out_specs=PartitionSpec("parts"), check_vma=False))
     x = jnp.linspace(0.9, 1.0, size * mesh.devices.size)
-    return 2 * chains * depth * times * x.size / _seconds(spread, jax.device_put(x, NamedSharding(mesh, PartitionSpec("parts"))))
-
-
-def _seconds(function: Callable, *args: Any, rounds: int = 9) -> float:
-    jax.block_until_ready(function(*args))
-    times = []
-    for _ in range(rounds):
-        start = time.perf_counter()
-        jax.block_until_ready(function(*args))
-        times.append(time.perf_counter() - start)
-    return float(np.median(times))
+    job = Timed(spread, jax.device_put(x, NamedSharding(mesh, PartitionSpec("parts"))))
+    take_turns([job], 9)
+    return 2e6 * chains * depth * times * x.size / job.summary()["median_us"]
 
 
 def million(samples: int = MILLION) -> dict[str, Any]:

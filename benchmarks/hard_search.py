@@ -154,10 +154,7 @@ def shape(strain: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def residual(draw: Draw, forces: np.ndarray, strain: np.ndarray) -> float:
-    """Largest imbalance of a cross-section between the first and the last node, as a share of the wrenches in balance there.
-
-    No step looks beyond the last node, 0.7 % of the length before the tip: a section may have collapsed there unseen.
-    """
+    """Largest imbalance of a cross-section between the first and the last node, as a share of the wrenches in balance there."""
     L, base = draw.length, draw.length / (2 * draw.slenderness)
     X = np.linspace(0, L, len(strain))
     radius = base * (1 + (draw.tip - 1) * X / L)

@@ -5,6 +5,7 @@ import io
 import json
 import pathlib
 import re
+import sys
 from typing import NamedTuple
 
 import numpy as np
@@ -177,9 +178,20 @@ def test_sweep_keeps_and_draws_a_workspace(tmp_path, capsys):
     assert {name: kept[name].shape for name in kept} == {"inputs": (50, 1), "tip": (50, 4, 4), "lengths": (50, 1), "status": (50,)}
 
 
+def test_a_sweep_to_disk_without_zarr_is_one_line(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "zarr", None)
+    assert cli.main(["sweep", HELIX, "--low", "-5", "--out", str(tmp_path / "w.zarr")]) == cli_common.BAD_USAGE
+    assert capsys.readouterr().err == 'vsr-jax: sweep.out: Zarr is not installed, need pip install "vsr-jax[sweep]"\n'
+
+
 def test_a_sweep_without_a_solution_exits_with_1(capsys):
     assert cli.main(["sweep", HELIX, "--samples", "3", "--low", "-9e3", "--high", "-5e3", "--steps", "8"]) == cli_common.NOT_CONVERGED
     assert "samples     3 collapsed\n" in capsys.readouterr().out
+
+
+def test_bounds_of_a_sweep_are_in_order(capsys):
+    assert cli.main(["sweep", HELIX, "--low", "1", "--high", "-1"]) == cli_common.BAD_USAGE
+    assert capsys.readouterr().err == "vsr-jax: --low: got 1, need at most --high, -1\n"
 
 
 def test_bounds_of_a_sweep_are_one_or_one_an_actuator(capsys):

@@ -30,7 +30,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = _parser().parse_args([_spaced(argument) for argument in (sys.argv[1:] if argv is None else argv)])
     try:
         return options.run(options)
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, ImportError) as error:
         print(f"vsr-jax: {' '.join(str(error).split())}", file=sys.stderr)
         return BAD_USAGE
 

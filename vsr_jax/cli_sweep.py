@@ -42,6 +42,8 @@ def _sweep(options: argparse.Namespace) -> int:
     actuators, dtype = len(task.scene.actuators), task.inputs.dtype
     low = _bounds("--low", [0.0] if options.low is None else options.low, actuators)
     high = _bounds("--high", np.asarray(task.inputs) if options.high is None else options.high, actuators)
+    if np.any(low > high):
+        raise ValueError(f"--low: got {_row(low)}, need at most --high, {_row(high)}")
     inputs = np.random.default_rng(options.seed).uniform(low, high, (options.samples, actuators)).astype(dtype)
     outputs = tuple(dict.fromkeys([*options.outputs, "tip"]))
     start = time.perf_counter()
@@ -59,6 +61,10 @@ def _bounds(name: str, values: Any, actuators: int) -> np.ndarray:
     if len(values) not in (1, actuators):
         raise ValueError(f"{name}: got {len(values)} numbers, need one for all actuators or {actuators}, one for each")
     return np.broadcast_to(np.asarray(values, float), actuators)
+
+
+def _row(values: np.ndarray) -> str:
+    return " ".join(f"{value:g}" for value in values)
 
 
 def _lines(title: str, low: np.ndarray, high: np.ndarray, result: Sweep, tips: np.ndarray) -> list[str]:

@@ -81,7 +81,7 @@ class StrainDependent(SteppedModel):
 def _status_of_ends(scene: Scene, forces: Vector, xi: Vector) -> Array:
     """Status of the arm's two ends, which no node sees: a tapering arm fails at its tip first. One Newton step from the
     strain at the node beside is exact enough to tell."""
-    sections = scene.sections(scene.edges()[jnp.array([0, -1])])
+    sections = scene.sections(jnp.stack([jnp.zeros_like(scene.rod.length), scene.rod.length]))
     tau = sections.carry(forces)
     beside = lax.stop_gradient(tuple(jnp.stack([x[0, 0], x[-1, -1]]) for x in xi))
     _, step = newton_step(beside, sections, tau, None, scene.free)
