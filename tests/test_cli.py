@@ -197,3 +197,16 @@ def test_bounds_of_a_sweep_are_in_order(capsys):
 def test_bounds_of_a_sweep_are_one_or_one_an_actuator(capsys):
     assert cli.main(["sweep", HELIX, "--low", "1", "2"]) == cli_common.BAD_USAGE
     assert "--low: got 2 numbers, need one for all actuators or 1, one for each" in capsys.readouterr().err
+
+
+def test_a_tolerance_chooses_the_steps_and_tells_the_error(capsys):
+    assert cli.main(["solve", HELIX, "--tolerance", "1e-4"]) == cli_common.DONE
+    error = re.search(r"  error      (\S+) m of the tip by estimate, with StrainDependent\(steps=(\d+), order=6\)", capsys.readouterr().out)
+    assert error
+    assert 1e-6 < float(error[1]) < 1e-4
+    assert int(error[2]) < 32
+
+
+def test_a_tolerance_goes_without_steps(capsys):
+    assert cli.main(["solve", HELIX, "--tolerance", "1e-4", "--steps", "8"]) == cli_common.BAD_USAGE
+    assert "--tolerance: got --model or --steps too, need one or the other" in capsys.readouterr().err

@@ -106,6 +106,10 @@ def differences(function, case):
 CONVERGED = [name for name, case in TABLE.items() if case.status == vsr.Status.CONVERGED]
 
 
+PRECISIONS = pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
+
+
+@PRECISIONS
 @pytest.mark.parametrize("name", TABLE)
 def test_status_and_shape_are_what_they_must_be(name, dtype):
     case = TABLE[name]
@@ -164,6 +168,7 @@ def shape_of(scene, inputs):
     return eq.tip[:3, 3] / scene.rod.length, eq.stability, eq.status
 
 
+@PRECISIONS
 @pytest.mark.parametrize("young", [1e3, 1e6, 2e11])
 @pytest.mark.parametrize("length", [1e-3, 0.3, 10.0])
 def test_arms_of_all_sizes_and_stiffnesses_behave_alike(length, young, dtype):

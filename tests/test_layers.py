@@ -12,8 +12,9 @@ LAYERS = """
 _types _check component implicit se3 quadrature profile section material routing actuator rod load scene newton balance kinematics
 resolution
 cable reaction elimination friction coupled coupled_tangent coupled_solve basis model galerkin discrete
-strain_dependent shooting continuum stability equilibrium solve health continuation archive parallel sweep
-scenefile plot paper paper_figures reproduce report timing effects cli_common cli_scene cli_sweep cli_studies cli
+strain_dependent estimate shooting continuum stability equilibrium plan solve inverse health continuation archive parallel sweep
+scenefile plot paper paper_figures reproduce report timing effects accuracy accuracy_figures
+cli_common cli_scene cli_sweep cli_inverse cli_studies cli
 """.split()  # noqa: SIM905
 
 
@@ -41,5 +42,5 @@ def test_the_public_face_draws_nothing():
     import subprocess
     import sys
 
-    code = "import sys, vsr_jax; print([m for m in ('matplotlib', 'diffrax', 'optax') if m in sys.modules])"
+    code = "import sys, vsr_jax; print([m for m in ('matplotlib', 'diffrax', 'optax', 'optimistix') if m in sys.modules])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"

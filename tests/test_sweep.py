@@ -66,7 +66,7 @@ def test_outputs_by_name_and_by_function(expected):
     named = vsr.sweep(arm(0.006), inputs, outputs=("lengths", "stability"), model=MODEL, progress=False)
     assert {name: x.shape for name, x in named.items()} == {"lengths": (23, 2), "stability": (23,)}
     made = vsr.sweep(arm(0.006), inputs, outputs=lambda eq: {"end": eq.tip[:3, 3], "middle": eq.position(0.1)}, model=MODEL, progress=False)
-    np.testing.assert_array_equal(made["end"], expected[:, :3, 3])
+    np.testing.assert_allclose(made["end"], expected[:, :3, 3], rtol=1e-13)  # another program, which may round otherwise
     assert made["middle"].shape == (23, 3)
 
 

@@ -21,6 +21,7 @@ from .discrete import (
     stiffness_matrix as stiffness_matrix,
 )
 from .equilibrium import Equilibrium as Equilibrium
+from .estimate import Error as Error
 from .health import Health as Health, check as check
 from .kinematics import step_twist as step_twist, zanna_step as zanna_step
 from .load import (
@@ -31,6 +32,7 @@ from .load import (
 )
 from .material import Material as Material
 from .model import Status as Status
+from .plan import Plan as Plan, plan as plan
 from .profile import (
     Constant as Constant,
     FunctionProfile as FunctionProfile,
@@ -62,14 +64,19 @@ from .sweep import Sweep as Sweep, sweep as sweep
 
 if TYPE_CHECKING:
     from .continuum import Continuum as Continuum
+    from .inverse import Reach as Reach, reach as reach
 
 __version__ = "0.1.0"
 
 
 def __getattr__(name: str) -> Any:
-    # diffrax takes a third of the import time and only `Continuum` needs it.
+    # diffrax and optimistix take a third of the import time, and only these need them.
     if name == "Continuum":
         from .continuum import Continuum
 
         return Continuum
+    if name in ("Reach", "reach"):
+        from . import inverse
+
+        return getattr(inverse, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

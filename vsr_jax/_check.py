@@ -48,6 +48,15 @@ def numbers(
     return array
 
 
+def positive(name: str, value: Any) -> float:
+    """`value` as a Python float, finite and > 0."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number | np.ndarray | Array) or is_traced(value):
+        raise _refuse(name, value, "a finite number > 0")
+    if np.ndim(value) or not (np.isfinite(value) and value > 0):
+        raise _refuse(name, value, "a finite number > 0")
+    return float(value)
+
+
 def count(name: str, value: Any, *, least: int = 1) -> int:
     """`value` as an integer of at least `least`."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:

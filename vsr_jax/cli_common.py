@@ -2,11 +2,12 @@
 
 import argparse
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 DONE, NOT_CONVERGED, BAD_USAGE = 0, 1, 2
 """Exit codes."""
@@ -35,6 +36,22 @@ def check_folders(*paths: str | None) -> None:
     for path in paths:
         if path is not None and not Path(path).parent.is_dir():
             raise ValueError(f"{path}: there is no folder {str(Path(path).parent)!r}")
+
+
+def bounds(low: Sequence[float] | None, high: Sequence[float] | None, usual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Least and greatest inputs, one number an actuator, from `--low` and `--high`: 0 and `usual` where they are not given.
+
+    **Raises:** `ValueError` for another number of them, and where they are crossed.
+    """
+    pair = []
+    for name, values in (("--low", [0.0] if low is None else low), ("--high", usual if high is None else high)):
+        if len(values) not in (1, len(usual)):
+            raise ValueError(f"{name}: got {len(values)} numbers, need one for all actuators or {len(usual)}, one for each")
+        pair.append(np.broadcast_to(np.asarray(values, float), usual.shape))
+    if np.any(pair[0] > pair[1]):
+        low_row, high_row = (" ".join(f"{value:g}" for value in row) for row in pair)
+        raise ValueError(f"--low: got {low_row}, need at most --high, {high_row}")
+    return pair[0], pair[1]
 
 
 def hasten(*, optimise: bool) -> None:

@@ -92,6 +92,7 @@ def add_scene(parser: argparse.ArgumentParser) -> None:
         help=f"how to solve (default: vsr.solve chooses); prescribed: Legendre polynomials to order {LEGENDRE_ORDER} for each free strain",
     )
     parser.add_argument("--steps", metavar="N", type=positive, help="steps along the arm (default: the model's)")
+    parser.add_argument("--tolerance", metavar="M", type=float, help="as many steps as bring the tip within M metres, instead of --steps")
     parser.add_argument("--precision", choices=("float64", "float32"), default="float64", help="of all numbers (default: %(default)s)")
 
 
@@ -117,6 +118,8 @@ def task_of(options: argparse.Namespace) -> Task:
         kinds = ", ".join(type(actuator).__name__ for actuator in scene.actuators)
         raise ValueError(f"{options.scene}: holds no inputs, need --inputs, one number each for {kinds}")
     values = jnp.asarray([] if inputs is None else inputs, options.precision)
+    if options.tolerance is not None and (options.model, options.steps) != (None, None):
+        raise ValueError("--tolerance: got --model or --steps too, need one or the other: a tolerance chooses both")
     return Task(scene, values, _model(options.model, options.steps, scene), title)
 
 
@@ -124,7 +127,7 @@ def _solve(options: argparse.Namespace) -> int:
     hasten(optimise=False)
     scene, inputs, model, title = task_of(options)
     check_folders(options.plot, options.json)
-    eq = solve(scene, inputs, model=model)
+    eq = solve(scene, inputs, model=model, tolerance=options.tolerance)
     _tell(eq, title, options)
     return DONE if bool(eq.converged) else NOT_CONVERGED
 
@@ -135,10 +138,11 @@ def _check(options: argparse.Namespace) -> int:
     hasten(optimise=True)
     scene, inputs, model, title = task_of(options)
     check_folders(options.json)
+    model = model if options.tolerance is None else solve(scene, inputs, tolerance=options.tolerance).model
     health = check(scene, inputs, model=model)
     print("\n".join(report.health_lines(health, title or options.scene)))
     if options.json:
-        _save(options.json, {"scene": options.scene, "title": title, **report.health_record(health)})
+        save(options.json, {"scene": options.scene, "title": title, **report.health_record(health)})
     return DONE if bool(health.equilibrium.converged) else NOT_CONVERGED
 
 
@@ -148,12 +152,12 @@ def _tell(eq: Equilibrium, title: str, options: argparse.Namespace) -> None:
     matplotlib.use("Agg")
     from . import plot, report
 
-    print("\n".join(report.lines(eq, title or options.scene)))
+    print("\n".join(report.lines(eq, title or options.scene, error=options.tolerance is not None)))
     samples = None
     if bool(eq.converged) and (options.plot or options.json):
         samples = plot.sample(eq, np.linspace(0.0, float(eq.scene.rod.length), STATIONS))
     if options.json:
-        _save(options.json, {"scene": options.scene, "title": title, **report.record(eq, samples)})
+        save(options.json, {"scene": options.scene, "title": title, **report.record(eq, samples)})
     if options.plot and samples is not None:
         ax = plot.arm(samples)
         ax.set_title(title)
@@ -162,7 +166,8 @@ def _tell(eq: Equilibrium, title: str, options: argparse.Namespace) -> None:
         print(f"vsr-jax: {options.plot} is not drawn, there is no shape", file=sys.stderr)
 
 
-def _save(path: str, content: dict[str, Any]) -> None:
+def save(path: str, content: dict[str, Any]) -> None:
+    """Writes a JSON file."""
     Path(path).write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 

@@ -1,4 +1,5 @@
-"""The commands that study: `paper` runs section IV of the paper anew, `effects` shows what each effect of a scene costs."""
+"""The commands that study: `paper` runs section IV of the paper anew, `effects` shows what each effect of a scene costs,
+`accuracy` what each digit costs."""
 
 import argparse
 import json
@@ -7,9 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
 from .cli_common import DONE, NOT_CONVERGED, check_folders, command, positive
+from .cli_scene import Task, task_of
 from .strain_dependent import StrainDependent
+
+_GROUPS = ("steps", "bases", "continuum")
+"""Those of `accuracy`, which takes a second to import."""
 
 
 def add_paper(commands: Any) -> None:
@@ -45,6 +52,27 @@ def add_effects(commands: Any) -> None:
     parser.add_argument("--json", metavar="FILE", help="save the figures")
 
 
+def add_accuracy(commands: Any) -> None:
+    """Adds the command `accuracy`."""
+    parser = command(
+        commands,
+        "accuracy",
+        help="show what accuracy costs on a scene, by every model",
+        description="Solves a scene, the paper's B2 by default, by every model at several resolutions, for inputs drawn between a tenth\n"
+        "and the whole of those given. Prints errors of tip, strain and gradient and the times they take, and says what to use for\n"
+        "a millimetre, a micrometre and a nanometre. Compiles some thirty programs three times: five minutes, more with loads.",
+        example="vsr-jax accuracy scene.toml --groups steps --plot accuracy.png --json accuracy.json",
+        run=_accuracy,
+    )
+    parser.add_argument("scene", metavar="SCENE", nargs="?", help="the TOML file (default: the paper's B2)")
+    parser.add_argument("--inputs", metavar="U", nargs="+", type=float, help="one number an actuator (default: those of the file)")
+    parser.add_argument("--groups", nargs="+", choices=_GROUPS, default=list(_GROUPS), help="models (default: all)")
+    parser.set_defaults(model=None, steps=None, precision="float64")
+    parser.add_argument("--lanes", type=positive, default=128, help="shapes in the batch (default: %(default)s)")
+    parser.add_argument("--plot", metavar="FILE", help="draw tip errors over times: .png, .pdf, .svg")
+    parser.add_argument("--json", metavar="FILE", help="save the figures")
+
+
 def _paper(options: argparse.Namespace) -> int:
     import matplotlib
 
@@ -74,3 +102,34 @@ def _effects(options: argparse.Namespace) -> int:
         rows = [cost._asdict() for cost in costs]
         Path(options.json).write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
     return DONE if all(cost.converged == 1 for cost in costs) else NOT_CONVERGED
+
+
+def _two_helices(inputs: list[float] | None) -> Task:
+    from . import paper
+
+    values = np.asarray([-15.0, -15.0] if inputs is None else inputs)
+    scene = paper.scene("B2")
+    return Task(scene, scene.check_inputs(values), None, "B2, two helices")
+
+
+def _accuracy(options: argparse.Namespace) -> int:
+    import matplotlib
+
+    jax.config.update("jax_enable_x64", True)
+    matplotlib.use("Agg")
+    from . import accuracy, accuracy_figures
+
+    check_folders(options.plot, options.json)
+    task = task_of(options) if options.scene else _two_helices(options.inputs)
+    shares = np.random.default_rng(0).uniform(0.1, 1.0, (options.lanes, task.inputs.size))
+    ways = accuracy.settings(task.scene, groups=options.groups)
+    rows = accuracy.measure(
+        task.scene, jnp.asarray(shares) * task.inputs, ways, say=lambda name: print(f"compiling: {name}", file=sys.stderr)
+    )
+    print("\n".join([*accuracy.table(rows), "", *accuracy.advice(rows)]))
+    named = {task.title or options.scene: rows}
+    if options.json:
+        Path(options.json).write_text(json.dumps(accuracy.records(named), indent=1) + "\n", encoding="utf-8")
+    if options.plot:
+        accuracy_figures.work_precision(named).savefig(options.plot, dpi=150)
+    return DONE if any(row.tip is not None for row in rows) else NOT_CONVERGED

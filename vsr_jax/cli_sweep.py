@@ -8,8 +8,9 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from .cli_common import DONE, NOT_CONVERGED, check_folders, command, one_device_a_core, positive
+from .cli_common import DONE, NOT_CONVERGED, bounds, check_folders, command, one_device_a_core, positive
 from .cli_scene import add_scene, task_of
+from .plan import plan
 from .sweep import OUTPUTS, Sweep, sweep
 
 
@@ -40,14 +41,12 @@ def _sweep(options: argparse.Namespace) -> int:
     task = task_of(options)
     check_folders(options.out, options.plot)
     actuators, dtype = len(task.scene.actuators), task.inputs.dtype
-    low = _bounds("--low", [0.0] if options.low is None else options.low, actuators)
-    high = _bounds("--high", np.asarray(task.inputs) if options.high is None else options.high, actuators)
-    if np.any(low > high):
-        raise ValueError(f"--low: got {_row(low)}, need at most --high, {_row(high)}")
+    low, high = bounds(options.low, options.high, np.asarray(task.inputs))
     inputs = np.random.default_rng(options.seed).uniform(low, high, (options.samples, actuators)).astype(dtype)
+    model = task.model if options.tolerance is None else plan(task.scene, options.tolerance, (low.astype(dtype), high.astype(dtype))).model
     outputs = tuple(dict.fromkeys([*options.outputs, "tip"]))
     start = time.perf_counter()
-    result = sweep(task.scene, inputs, outputs=outputs, model=task.model, out=options.out)
+    result = sweep(task.scene, inputs, outputs=outputs, model=model, out=options.out)
     seconds = time.perf_counter() - start
     tips = np.asarray(result["tip"])[:, :3, 3]
     print("\n".join(_lines(task.title or options.scene, low, high, result, tips)))
@@ -55,16 +54,6 @@ def _sweep(options: argparse.Namespace) -> int:
     if options.plot:
         _draw(options.plot, task.title, tips, inputs, low, high)
     return DONE if np.any(result.converged) else NOT_CONVERGED
-
-
-def _bounds(name: str, values: Any, actuators: int) -> np.ndarray:
-    if len(values) not in (1, actuators):
-        raise ValueError(f"{name}: got {len(values)} numbers, need one for all actuators or {actuators}, one for each")
-    return np.broadcast_to(np.asarray(values, float), actuators)
-
-
-def _row(values: np.ndarray) -> str:
-    return " ".join(f"{value:g}" for value in values)
 
 
 def _lines(title: str, low: np.ndarray, high: np.ndarray, result: Sweep, tips: np.ndarray) -> list[str]:

@@ -23,9 +23,9 @@ from ._types import Scalar, cast
 from .balance import chosen, spread, with_locked
 from .coupled import Kind, Problem, Unknown, imbalance_of, problem_of, state_of, with_tensions
 from .equilibrium import Equilibrium
-from .model import Outcome, Status
+from .model import Outcome, Status, resolved
 from .scene import Scene
-from .solve import resolved, solve
+from .solve import solve
 from .strain_dependent import StrainDependent
 
 _MOST_CORRECTIONS = 8

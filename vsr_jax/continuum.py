@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from . import component as c
-from ._check import count, instance, numbers
+from ._check import count, instance, positive
 from ._types import Pose, Scalar, Twist
 from .balance import ALL, forces_where, residual, rounding_floor, solve_balance, strain_norm, tangent
 from .component import Vector
@@ -65,7 +65,7 @@ class Continuum(Model):
       the tensions that thread lengths and friction call for.
     """
 
-    solver: diffrax.AbstractSolver
+    solver: diffrax.AbstractSolver = eqx.field(static=True)
     rtol: float = eqx.field(static=True)
     atol: float = eqx.field(static=True)
     max_steps: int = eqx.field(static=True)
@@ -83,8 +83,8 @@ class Continuum(Model):
     ):
         chosen = diffrax.Dopri8() if solver is None else solver
         self.solver = instance("Continuum.solver", chosen, diffrax.AbstractSolver, "a diffrax solver")
-        self.rtol = float(numbers("Continuum.rtol", rtol, positive=True))
-        self.atol = float(numbers("Continuum.atol", atol, positive=True))
+        self.rtol = positive("Continuum.rtol", rtol)
+        self.atol = positive("Continuum.atol", atol)
         self.max_steps = count("Continuum.max_steps", max_steps)
         self.segments = count("Continuum.segments", segments)
         steps = StrainDependent(64) if derivative is None else derivative

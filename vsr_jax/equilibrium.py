@@ -12,6 +12,7 @@ from ._types import Pose, Scalar
 from .balance import forces_where
 from .cable import cable_of, path_length
 from .component import Vector
+from .estimate import Error, error_of
 from .model import Model, Nodes, Outcome, Status
 from .reaction import loading, react_at
 from .scene import Scene
@@ -94,6 +95,12 @@ class Equilibrium(eqx.Module):
         return self._mask(greatest / jnp.abs(least))
 
     @property
+    def error(self) -> Error:
+        """Estimates of the errors of tip [m] and strain, from a finer solution that starts from this one; NaN where it failed."""
+        self._refuse_batch()
+        return self._error()
+
+    @property
     def lengths(self) -> Float[Array, " threads"]:
         """Length of each thread's path, $l_i = \\int |t_{ci}| dX$ [m]."""
         self._refuse_batch()
@@ -172,6 +179,11 @@ class Equilibrium(eqx.Module):
     def _path_lengths(self, nodes: Nodes) -> Array:
         places = range(len(self.scene.actuators))
         return jnp.array([path_length(nodes.xi, nodes.sections, i, nodes.grid) for i in places], self.inputs.dtype)
+
+    @eqx.filter_jit
+    def _error(self) -> Error:
+        error = error_of(self.model, self.scene, self.inputs, self._sound_forces, self._state)
+        return Error(self._mask(error.tip), self._mask(error.strain))
 
     @eqx.filter_jit
     def _lengths(self) -> Array:

@@ -15,7 +15,7 @@ from .balance import thread_direction, thread_wrench
 from .component import Vector, dot
 from .kinematics import step_components, step_poses, tip_pose
 from .quadrature import Grid, gauss_legendre, locate, make_grid
-from .resolution import step_error
+from .resolution import COARSE, step_error
 from .routing import Path, thread_tangent
 from .scene import CrossSections, Scene, shared
 from .se3 import exp_components, pose
@@ -150,6 +150,15 @@ class SteppedModel(Model):
         strain = self.strain(scene, forces, state, X_nodes.reshape(-1))
         stages = tuple(tuple(x.reshape(X_nodes.shape)[i] for x in strain) for i in range(len(nodes)))
         return jax.vmap(jnp.matmul)(ends[step], pose(*exp_components(step_components(stages, h))))
+
+
+def resolved(model: Model, scene: Scene, outcome: Outcome) -> Outcome:
+    """The outcome, with the status under-resolved where it had converged on steps that are too few for its shape."""
+    error = model.step_error(scene, outcome.forces, outcome.state)
+    if error is None:
+        return outcome
+    coarse = (outcome.status == Status.CONVERGED) & ~(error <= COARSE)
+    return outcome._replace(status=jnp.where(coarse, Status.UNDER_RESOLVED, outcome.status).astype(jnp.int32))
 
 
 def classify(xi: Vector, sections: CrossSections, tau: Vector, balanced: Array, definite: Array, *, loaded: bool = False) -> Array:

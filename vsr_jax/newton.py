@@ -14,6 +14,7 @@ MAX_STEPS = 50
 MAX_DAMPED_STEPS = 200
 LOAD_SHARES = 5
 _LEAST_FRACTION = 1e-6
+_FAST = 1e-4
 _LEAST_DAMPING, _MOST_DAMPING = 0.1, 1e8
 _RAISE, _LOWER = 10.0, 30.0
 _LEAST_LEFT, _MOST_LEFT = 0.25, 0.99
@@ -41,33 +42,36 @@ def newton(evaluate: Callable[[Any], Evaluation], start: Any, floor: Array) -> R
     """Root of a residual from `start`.
 
     A step that does not lower the residual's size is cut to a quarter and tried again. The loop ends when the next step
-    of every problem is so small that its own quadratic error is below rounding (that step is still taken), when the
-    fraction of a step has become negligible, or after 50 evaluations. The caller decides from the residual at the end
-    what was reached.
+    of every problem is so small that its own quadratic error is below rounding (that step is still taken; a greater one will
+    do where steps shrink fast), when the fraction of a step has become negligible, or after 50 evaluations. The caller
+    decides from the residual at the end what was reached.
 
     **Arguments:**
     - `evaluate`: maps a point, a pytree of arrays, to its `Evaluation`.
     - `floor`: size of the residual that counts as rounding; steps below it are always accepted.
     """
     merit = jnp.full_like(floor, jnp.inf)
-    small = jnp.finfo(merit.dtype).eps ** 0.6
+    eps = jnp.finfo(merit.dtype).eps
+    small, smaller = eps**0.5, eps**0.6
 
     def proceed(state: tuple) -> Array:
-        _, at, fraction, count = state
-        pending = ((at.size > small) | jnp.isinf(at.merit)) & (fraction > _LEAST_FRACTION)
+        _, at, fraction, enough, count = state
+        pending = ((at.size > enough) | jnp.isinf(at.merit)) & (fraction > _LEAST_FRACTION)
         return (count < MAX_STEPS) & jnp.any(pending)
 
     def advance(state: tuple) -> tuple:
-        x, at, fraction, count = state
+        x, at, fraction, enough, count = state
         trial = jax.tree.map(lambda a, s: a - fraction * s, x, at.step)
         new = evaluate(trial)
         better = (new.merit < at.merit) | (new.merit < floor)
+        enough = jnp.where(better & (new.size < _FAST * at.size), small, smaller)
         x, at = _where(better, (trial, new), (x, at))
-        return x, at, jnp.where(better, jnp.ones_like(fraction), fraction / 4), count + 1
+        return x, at, jnp.where(better, jnp.ones_like(fraction), fraction / 4), enough, count + 1
 
     still = jax.tree.map(jnp.zeros_like, start)
     first = Evaluation(still, jnp.zeros_like(merit), merit, jnp.ones(merit.shape, bool))
-    x, at, _, count = lax.while_loop(proceed, advance, (start, first, jnp.ones_like(merit), jnp.zeros((), jnp.int32)))
+    begin = (start, first, jnp.ones_like(merit), jnp.zeros_like(merit), jnp.zeros((), jnp.int32))
+    x, at, _, _, count = lax.while_loop(proceed, advance, begin)
     return Root(jax.tree.map(jnp.subtract, x, at.step), at.definite, count)
 
 

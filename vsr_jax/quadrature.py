@@ -37,23 +37,27 @@ def piece_edges(length: Scalar, breakpoints: tuple[Scalar, ...]) -> Float[Array,
     return jnp.sort(jnp.stack([jnp.zeros_like(length), *inner, length]))
 
 
-def make_grid(edges: Float[Array, " edges"], steps: int, stages: int) -> Grid:
+def make_grid(edges: Float[Array, " edges"], steps: int | Array, stages: int, *, room: int | None = None) -> Grid:
     """Grid of `steps` steps with `stages` nodes each.
 
     Every piece between `edges` has at least one step, an empty piece too, so that a derivative sees it open; the other
-    steps are shared by the lengths of the pieces.
+    steps are shared by the lengths of the pieces. Where `steps` is traced, `room` says how many there may be: those that are
+    not wanted are empty, at the end of the arm.
     """
-    if edges.size == 2:
-        piece, count, place = 0, steps, np.arange(steps)
-    else:
-        piece, count, place = _share(edges, max(steps, edges.size - 1))
+    least = edges.size - 1
+    place = np.arange(max(int(steps) if room is None else room, least))
+    wanted = max(int(steps), least) if room is None else jnp.maximum(steps, least)
+    piece, count, at = (0, wanted, place) if least == 1 else _share(edges, wanted, jnp.asarray(place))
     width = jnp.broadcast_to(jnp.diff(edges)[piece] / count, place.shape)
-    start = edges[:-1][piece] + place.astype(width.dtype) * width
+    start = edges[:-1][piece] + at.astype(width.dtype) * width
+    if room is not None:
+        there = place < wanted
+        width, start = jnp.where(there, width, 0.0), jnp.where(there, start, edges[-1])
     nodes, weights = (x.astype(width.dtype) for x in gauss_legendre(stages))
     return Grid(start, width, start + nodes[:, None] * width, jnp.asarray(weights[:, None] * width))
 
 
-def _share(edges: Float[Array, " edges"], steps: int) -> tuple[Array, Array, Array]:
+def _share(edges: Float[Array, " edges"], steps: int | Array, place: Array) -> tuple[Array, Array, Array]:
     """For each step its piece, the number of steps of that piece and its place among them; largest remainders get more."""
     lengths = jnp.diff(edges)
     exact = (steps - lengths.size) * lengths / jnp.sum(lengths)
@@ -62,8 +66,8 @@ def _share(edges: Float[Array, " edges"], steps: int) -> tuple[Array, Array, Arr
     spare = steps - lengths.size - jnp.sum(whole).astype(int)
     count = 1 + whole.astype(int) + (order < spare)
     last = jnp.cumsum(count)
-    piece = jnp.searchsorted(last, jnp.arange(steps), side="right")
-    return piece, count[piece], jnp.arange(steps) - (last - count)[piece]
+    piece = jnp.minimum(jnp.searchsorted(last, place, side="right"), lengths.size - 1)
+    return piece, count[piece], place - (last - count)[piece]
 
 
 def interpolation(stages: int) -> np.ndarray:

@@ -6,11 +6,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ._check import instance, is_traced
+from ._check import instance, is_traced, positive
 from ._types import cast
 from .equilibrium import Equilibrium
-from .model import Model, Outcome, Status
-from .resolution import COARSE
+from .model import Model, Outcome, Status, resolved
+from .plan import choose
 from .scene import Scene
 from .strain_dependent import StrainDependent
 
@@ -19,7 +19,7 @@ class SolveError(RuntimeError):
     """Raised by `solve(..., throw=True)` when no equilibrium was found; its text is the status in words."""
 
 
-def solve(scene: Scene, inputs: Any, *, model: Model | None = None, throw: bool = False) -> Equilibrium:
+def solve(scene: Scene, inputs: Any, *, model: Model | None = None, tolerance: float | None = None, throw: bool = False) -> Equilibrium:
     r"""Static equilibrium of a scene: a stationary point of
 
     $\Pi(\xi) = \int_0^L \frac12 (\xi - \xi^*)^T \Sigma (\xi - \xi^*) \, dX - \sum_i \tau_i l_i(\xi)$,
@@ -32,19 +32,32 @@ def solve(scene: Scene, inputs: Any, *, model: Model | None = None, throw: bool 
     - `inputs`: one number an actuator: tau [N] for a `Thread`, tension [N] for a `Tendon`, pressure [Pa] for a
       `Chamber`. Their dtype is the precision of the whole computation.
     - `model`: `StrainDependent()` by default, the exact one; `Prescribed(basis)`; `Continuum()`.
+    - `tolerance` [m]: of the tip's place, instead of a `model`: as many steps as it takes for these inputs, found by trying (see
+      `plan`, which also chooses for ranges of inputs and for gradients, and beforehand, as `jax.jit` needs it). What was
+      chosen is the `model` of the result; `eq.error` says what came of it.
     - `throw`: raise if the solve did not converge. Otherwise the status says so and the shape is NaN.
 
-    **Raises:** `ValueError` for a wrong number of inputs and, where their values are known, for NaN or a tension < 0.
+    **Raises:** `ValueError` for a wrong number of inputs and, where their values are known, for NaN or a tension < 0; for a
+    tolerance that no number of steps meets, or together with a model.
     `SolveError` with `throw=True`; under `jax.jit` the error equinox raises at run time.
 
     **Source:** eq. (8)-(21) of Renda et al. 2020.
     """
     instance("scene", scene, Scene, "a Scene")
     values = scene.check_inputs(inputs)
-    chosen = StrainDependent() if model is None else instance("model", model, Model, "StrainDependent(), Prescribed(basis) or Continuum()")
+    chosen = _model(scene, values, model, tolerance)
     scene, chosen = cast((scene, chosen), values.dtype)
     equilibrium = Equilibrium(scene, values, chosen, _solve(scene, values, chosen))
     return _raise_if_failed(equilibrium) if throw else equilibrium
+
+
+def _model(scene: Scene, inputs: Array, model: Model | None, tolerance: float | None) -> Model:
+    if tolerance is not None:
+        if model is not None:
+            raise ValueError(f"tolerance: got {tolerance!r} and a model, need one of them: a model says itself how fine it is")
+        found = choose(scene, positive("tolerance", tolerance), inputs[None])
+        return StrainDependent() if found is None else found.model
+    return StrainDependent() if model is None else instance("model", model, Model, "StrainDependent(), Prescribed(basis) or Continuum()")
 
 
 @eqx.filter_jit
@@ -53,15 +66,6 @@ def _solve(scene: Scene, inputs: Float[Array, " inputs"], model: Model) -> Outco
     outcome = resolved(model, scene, model.solve(scene, jnp.where(finite & admitted, inputs, 0.0)))
     status = jnp.where(admitted, outcome.status, Status.INADMISSIBLE)
     return outcome._replace(status=jnp.where(finite, status, Status.NOT_FINITE).astype(jnp.int32))
-
-
-def resolved(model: Model, scene: Scene, outcome: Outcome) -> Outcome:
-    """The outcome, with the status under-resolved where it had converged on steps that are too few for its shape."""
-    error = model.step_error(scene, outcome.forces, outcome.state)
-    if error is None:
-        return outcome
-    coarse = (outcome.status == Status.CONVERGED) & ~(error <= COARSE)
-    return outcome._replace(status=jnp.where(coarse, Status.UNDER_RESOLVED, outcome.status).astype(jnp.int32))
 
 
 def _raise_if_failed(equilibrium: Equilibrium) -> Equilibrium:

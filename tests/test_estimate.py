@@ -1,0 +1,85 @@
+"""Error estimates: against solutions at far more steps, and against the reference solutions of the paper's cases."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vsr_jax as vsr
+from vsr_jax import paper
+
+HELICES = paper.scene("B2")
+PULL = jnp.array([-8.0, -5.0])
+
+
+def honest(estimate, true):
+    """At least the true error, and at most twenty times as much."""
+    assert true <= estimate <= 20 * true
+
+
+def tip_distance(a, b):
+    return float(jnp.linalg.norm((a.tip - b.tip)[:3, 3]))
+
+
+@pytest.mark.parametrize(("steps", "order"), [(8, 6), (16, 6), (16, 4), (64, 2)])
+def test_tip_error_of_the_steps(steps, order):
+    eq = vsr.solve(HELICES, PULL, model=vsr.StrainDependent(steps, order))
+    honest(float(eq.error.tip), tip_distance(eq, vsr.solve(HELICES, PULL, model=vsr.StrainDependent(160))))
+
+
+def test_errors_against_the_independent_reference():
+    entry = paper.reference("B2")[0]
+    eq = vsr.solve(HELICES, entry.tau, model=vsr.StrainDependent(12))
+    honest(float(eq.error.tip), float(np.linalg.norm(np.asarray(eq.tip)[:3, 3] - entry.tip[:3, 3])))
+    strain = np.max(np.abs(np.asarray(eq.strain(entry.X)) - entry.strain), axis=0)
+    assert np.all(strain <= np.asarray(eq.error.strain))
+
+
+@pytest.mark.parametrize(
+    "model", [vsr.Prescribed(paper.basis("B2")), pytest.param(vsr.Continuum(rtol=1e-5, atol=1e-7), marks=pytest.mark.slow)]
+)
+def test_errors_of_the_other_models(model):
+    eq, exact = (vsr.solve(HELICES, PULL, model=m) for m in (model, vsr.StrainDependent(160)))
+    honest(float(eq.error.tip), tip_distance(eq, exact))
+    X = jnp.linspace(0, 0.75, 301)
+    true = np.max(np.abs(np.asarray(eq.strain(X) - exact.strain(X))), axis=0)
+    assert np.all((true <= 1.2 * eq.error.strain) & (eq.error.strain <= 20 * true))
+
+
+def loaded(**of_the_tendon):
+    arm = vsr.Rod(0.3, vsr.Circular(0.01), vsr.Material(5.93e5, shear=2e5, density=1000.0))
+    return vsr.Scene(arm, [vsr.Tendon(vsr.Helix(0.005, 1.5), **of_the_tendon)], [vsr.Gravity((0.0, 0.0, -9.81))])
+
+
+@pytest.mark.parametrize(
+    ("tendon", "value"),
+    [
+        ({}, 8.0),
+        pytest.param({"control": "length"}, -0.01, marks=pytest.mark.slow),
+        pytest.param({"friction": 0.1}, 8.0, marks=pytest.mark.slow),
+    ],
+)
+def test_errors_under_loads(tendon, value):
+    scene, inputs = loaded(**tendon), jnp.array([value])
+    eq = vsr.solve(scene, inputs, model=vsr.StrainDependent(6))
+    honest(float(eq.error.tip), tip_distance(eq, vsr.solve(scene, inputs, model=vsr.StrainDependent(32))))
+
+
+@pytest.mark.slow
+def test_errors_of_a_basis_under_loads():
+    scene, inputs = loaded(), jnp.array([8.0])
+    eq = vsr.solve(scene, inputs, model=vsr.Prescribed(vsr.Basis.uniform(vsr.Legendre(4)), steps=12))
+    honest(float(eq.error.tip), tip_distance(eq, vsr.solve(scene, inputs, model=vsr.StrainDependent(32))))
+
+
+def test_rounding_counts():
+    eq = vsr.solve(HELICES, PULL.astype(jnp.float32), model=vsr.StrainDependent(64))
+    exact = vsr.solve(HELICES, PULL, model=vsr.StrainDependent(160))
+    assert tip_distance(eq, exact) <= float(eq.error.tip) < 2e-4
+    assert eq.error.tip.dtype == eq.error.strain.dtype == jnp.float32
+
+
+def test_error_of_a_failed_solve_is_nan_and_it_batches():
+    tips = jax.vmap(lambda u: vsr.solve(HELICES, u, model=vsr.StrainDependent(16)).error.tip)(jnp.stack([PULL, 1e4 * PULL]))
+    assert np.isfinite(tips[0])
+    assert np.isnan(tips[1])

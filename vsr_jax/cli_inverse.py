@@ -1,0 +1,61 @@
+"""The command `reach`: the inputs that bring a scene's tip to a place."""
+
+import argparse
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from . import report
+from .cli_common import DONE, NOT_CONVERGED, bounds, check_folders, command, hasten
+from .cli_scene import add_scene, save, task_of
+
+
+def add_reach(commands: Any) -> None:
+    """Adds the command `reach`."""
+    parser = command(
+        commands,
+        "reach",
+        help="find the inputs of a scene file that bring its tip to a place",
+        description="Finds inputs between two bounds that bring the tip to a place with the least effort, and solves the scene there.\n"
+        "Ends with 1 where the place is out of reach; what is printed then is the nearest.",
+        example="vsr-jax reach scene.toml --target 0.5 0.1 0.2 --high 12",
+        run=_reach,
+    )
+    add_scene(parser)
+    parser.add_argument("--target", metavar=("X", "Y", "Z"), nargs=3, type=float, required=True, help="place of the tip [m]")
+    parser.add_argument("--low", metavar="U", nargs="+", type=float, help="least inputs, one for all or one an actuator (default: 0)")
+    parser.add_argument(
+        "--high", metavar="U", nargs="+", type=float, help="greatest inputs (default: twice --inputs, or those of the file)"
+    )
+    parser.add_argument("--json", metavar="FILE", help="save target, inputs, miss and the pose of the tip")
+
+
+def _reach(options: argparse.Namespace) -> int:
+    from .inverse import reach
+
+    hasten(optimise=True)
+    task = task_of(options)
+    check_folders(options.json)
+    low, high = bounds(options.low, options.high, 2 * np.asarray(task.inputs))
+    model = task.model if options.tolerance is None else _planned(task.scene, options.tolerance, low, high, task.inputs.dtype)
+    found = reach(task.scene, jnp.asarray(options.target, task.inputs.dtype), (low, high), model=model)
+    print("\n".join(report.lines(found.equilibrium, task.title or options.scene)))
+    print(f"  inputs     {', '.join(f'{value:.6g}' for value in np.asarray(found.inputs))}")
+    print(f"  miss       {float(found.miss):.2g} m" + ("" if bool(found.reached) else ": out of reach, this is the nearest found"))
+    if options.json:
+        outcome = {
+            "target": options.target,
+            "inputs": np.asarray(found.inputs).tolist(),
+            "miss": float(found.miss),
+            "reached": bool(found.reached),
+            "tip": np.asarray(found.equilibrium.tip).tolist(),
+        }
+        save(options.json, {"scene": options.scene, "title": task.title, **outcome})
+    return DONE if bool(found.reached) else NOT_CONVERGED
+
+
+def _planned(scene: Any, tolerance: float, low: np.ndarray, high: np.ndarray, dtype: Any) -> Any:
+    from .plan import plan
+
+    return plan(scene, tolerance, (jnp.asarray(low, dtype), jnp.asarray(high, dtype))).model
