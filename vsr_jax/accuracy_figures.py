@@ -52,14 +52,15 @@ def work_precision(
     handles: dict[str, Any] = {}
     for ax, (name, some) in zip(axes.flat, rows.items(), strict=False):
         handles |= _panel(ax, some, error, time)
-        for tool, (times, errors) in ((others or {}).get(name) or {}).items():
-            (handles[tool],) = ax.loglog(times, errors, color="#8B0000", marker="d", linestyle=":", markersize=5, label=tool)
+        for place, (tool, (times, errors)) in enumerate(((others or {}).get(name) or {}).items()):
+            face = "white" if place else "#8B0000"
+            (handles[tool],) = ax.loglog(times, errors, color="#8B0000", marker="d", linestyle=":", markersize=5, markerfacecolor=face)
         ax.set_title(name, fontsize=11)
         ax.grid(alpha=0.3)
         ax.xaxis.set_major_locator(LogLocator(numticks=6))
     figure.supxlabel(TIMES[time])
     figure.supylabel(ERRORS[error])
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=min(5, columns + 2), fontsize=9, frameon=False)
+    figure.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=min(5, columns + 2), fontsize=9, frameon=False)
     return figure
 
 
