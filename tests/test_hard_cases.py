@@ -215,6 +215,7 @@ def test_more_steps_resolve_the_fifty_turns(dtype):
     np.testing.assert_allclose(tip(200), tip(400), atol=max(1e-4, 1000 * epsilon(dtype)))
 
 
+@pytest.mark.slow
 def test_twenty_threads_in_a_ring_only_shorten_the_arm():
     angles = np.arange(20) * math.pi / 10
     ring = [vsr.Tendon(vsr.Parallel(0.008 * math.cos(a), 0.008 * math.sin(a))) for a in angles]

@@ -52,6 +52,7 @@ def test_solve_chooses_for_its_inputs():
     assert eq.model.steps < 32
 
 
+@pytest.mark.slow
 def test_gradient_tolerance_holds_against_differences_of_ten_times_the_steps():
     chosen = vsr.plan(HELICES, 1e-2, ([-8.0, -5.0], [-8.0, -5.0]), gradient_tolerance=1e-4)
     inputs = jnp.array([-8.0, -5.0])

@@ -66,6 +66,7 @@ def test_derivatives_by_every_number_agree(name, scene):
         np.testing.assert_allclose(reverse[i] / scale, jnp.dot(cotangent, forward) / scale, atol=1e-9, err_msg=f"number {i}, value {x}")
 
 
+@pytest.mark.slow
 def test_second_derivatives(helix):
     model = MODELS["prescribed"]  # those of the balance have a test of their own
 
