@@ -186,3 +186,11 @@ def test_precision_follows_the_inputs(dtype):
 def test_refusals_say_what_and_where(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_actuation_matrix_knows_where_a_thread_ends():
+    scene = vsr.Scene(paper.scene("A1").rod, [vsr.Thread(vsr.Parallel(0.004, 0.0), end=0.25)])
+    basis = vsr.Basis.uniform(vsr.Legendre(1))
+    eq = vsr.solve(scene, jnp.array([-0.01]), model=vsr.Prescribed(basis))
+    K, B = vsr.stiffness_matrix(scene, basis), vsr.actuation_matrix(scene, basis, eq.q)
+    np.testing.assert_allclose(K @ eq.q, B @ eq.forces, atol=1e-14)

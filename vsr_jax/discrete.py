@@ -221,7 +221,11 @@ def actuation_matrix(scene: Scene, basis: AbstractBasis, q: Float[Array, " dofs"
     """
     projection = project(scene, basis, points)
     xi = projection.strain(q)
-    columns = [projection.integrate(thread_wrench(thread_direction(xi, path)[0], path)) for path in projection.sections.paths]
+    ones = tuple(jnp.ones((), q.dtype) for _ in scene.actuators)
+    sections = projection.sections
+    columns = []
+    for path, share in zip(sections.paths, sections.carry(ones), strict=True):
+        columns.append(projection.integrate(c.scale(share, thread_wrench(thread_direction(xi, path)[0], path))))
     return jnp.stack(columns, axis=1)
 
 
