@@ -1,8 +1,9 @@
 """Differentiable statics of soft manipulators: Cosserat rods bent by tendons and fluidic chambers."""
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from . import se3 as se3
+from . import constraint as constraint, objective as objective, se3 as se3
 from .actuator import Chamber as Chamber, Tendon as Tendon, Thread as Thread
 from .basis import (
     Basis as Basis,
@@ -32,6 +33,7 @@ from .load import (
 )
 from .material import Material as Material
 from .model import Status as Status
+from .parameters import Parameter as Parameter, parameters as parameters
 from .plan import Plan as Plan, plan as plan
 from .profile import (
     Constant as Constant,
@@ -58,6 +60,15 @@ from .section import (
     Joined as Joined,
     Rectangular as Rectangular,
 )
+from .sensitivity import (
+    Ellipsoid as Ellipsoid,
+    Sensitivity as Sensitivity,
+    compliance as compliance,
+    compliance_ellipsoid as compliance_ellipsoid,
+    manipulability as manipulability,
+    sensitivity as sensitivity,
+    tip_jacobian as tip_jacobian,
+)
 from .solve import SolveError as SolveError, solve as solve
 from .strain_dependent import StrainDependent as StrainDependent
 from .sweep import Sweep as Sweep, sweep as sweep
@@ -65,18 +76,16 @@ from .sweep import Sweep as Sweep, sweep as sweep
 if TYPE_CHECKING:
     from .continuum import Continuum as Continuum
     from .inverse import Reach as Reach, reach as reach
+    from .optimize import Design as Design, design as design
 
 __version__ = "0.1.0"
 
 
+_LATER = {"Continuum": "continuum", "Reach": "inverse", "reach": "inverse", "Design": "optimize", "design": "optimize"}
+"""Where names lie that only some programs need: diffrax, optimistix and optax take a third of the import time."""
+
+
 def __getattr__(name: str) -> Any:
-    # diffrax and optimistix take a third of the import time, and only these need them.
-    if name == "Continuum":
-        from .continuum import Continuum
-
-        return Continuum
-    if name in ("Reach", "reach"):
-        from . import inverse
-
-        return getattr(inverse, name)
+    if name in _LATER:
+        return getattr(import_module(f".{_LATER[name]}", __name__), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

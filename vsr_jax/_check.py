@@ -48,6 +48,21 @@ def numbers(
     return array
 
 
+def interval(name: str, pair: Any, size: int) -> tuple[Array, Array]:
+    """Least and greatest of `size` numbers, one an actuator, from a pair of numbers or arrays; in order, where they are known."""
+    if not isinstance(pair, tuple | list) or len(pair) != 2:
+        raise _refuse(name, pair, "a pair, the least and the greatest inputs")
+    ends = [numbers(f"{name}[{i}]", end, None) for i, end in enumerate(pair)]
+    for i, end in enumerate(ends):
+        if end.shape not in ((), (size,)):
+            raise ValueError(f"{name}[{i}]: got shape {end.shape}, need one number or {size}, one an actuator")
+    low, high = (jnp.broadcast_to(end, (size,)) for end in ends)
+    known = concrete(low), concrete(high)
+    if known[0] is not None and known[1] is not None and np.any(known[0] > known[1]):
+        raise ValueError(f"{name}: got {known[0]} to {known[1]}, need the least inputs first")
+    return low, high
+
+
 def positive(name: str, value: Any) -> float:
     """`value` as a Python float, finite and > 0."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.number | np.ndarray | Array) or is_traced(value):

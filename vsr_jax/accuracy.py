@@ -1,7 +1,7 @@
 """What accuracy costs: errors of tip, strain and gradient of a scene by every model, and the time each takes."""
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -222,8 +222,3 @@ def table(rows: Iterable[Row]) -> list[str]:
         f"| {row.name} | {number(row.tip)} | {number(row.strain)} | {number(row.gradient)} | {row.single_us:.0f} | {row.batch_us:.1f} |"
         for row in rows
     ]
-
-
-def records(rows: Mapping[str, Sequence[Row]]) -> dict[str, list[dict[str, Any]]]:
-    """Rows of several scenes for JSON."""
-    return {name: [row._asdict() for row in some] for name, some in rows.items()}

@@ -1,4 +1,4 @@
-"""The command `vsr-jax`: scenes solved, checked, swept and told where to reach, the paper run anew, what effects and accuracy cost."""
+"""The command `vsr-jax`: scenes solved, checked, swept, designed and told where to reach, the paper run anew, what things cost."""
 
 import argparse
 import sys
@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from . import __version__
 from .cli_common import BAD_USAGE, EXIT_CODES
+from .cli_design import add_design
 from .cli_inverse import add_reach
 from .cli_scene import add_check, add_solve
 from .cli_studies import add_accuracy, add_effects, add_paper
@@ -16,6 +17,7 @@ EXAMPLES = (
     "vsr-jax check scene.toml",
     "vsr-jax sweep scene.toml --samples 100000 --plot workspace.png",
     "vsr-jax reach scene.toml --target 0.5 0.1 0.2 --high 12",
+    "vsr-jax design problem.toml --out designed.toml",
     "vsr-jax paper --out results",
     "vsr-jax effects",
     "vsr-jax accuracy scene.toml",
@@ -59,6 +61,7 @@ def _parser() -> argparse.ArgumentParser:
     add_check(commands)
     add_sweep(commands)
     add_reach(commands)
+    add_design(commands)
     add_paper(commands)
     add_effects(commands)
     add_accuracy(commands)

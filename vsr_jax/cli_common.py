@@ -38,6 +38,23 @@ def check_folders(*paths: str | None) -> None:
             raise ValueError(f"{path}: there is no folder {str(Path(path).parent)!r}")
 
 
+def add_bounds(parser: argparse.ArgumentParser, usual: str) -> None:
+    """The arguments of `bounds`; `usual`: what the greatest inputs are where they are not given."""
+    parser.add_argument("--low", metavar="U", nargs="+", type=float, help="least inputs, one for all or one an actuator (default: 0)")
+    parser.add_argument("--high", metavar="U", nargs="+", type=float, help=f"greatest inputs (default: {usual})")
+
+
+def add_precision(parser: argparse.ArgumentParser) -> None:
+    """The argument of `use`."""
+    parser.add_argument("--precision", choices=("float64", "float32"), default="float64", help="of all numbers (default: %(default)s)")
+
+
+def use(precision: str) -> None:
+    """Has JAX know double precision, if that is asked for; comes before any number is made."""
+    if precision == "float64":
+        jax.config.update("jax_enable_x64", True)
+
+
 def bounds(low: Sequence[float] | None, high: Sequence[float] | None, usual: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Least and greatest inputs, one number an actuator, from `--low` and `--high`: 0 and `usual` where they are not given.
 

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from . import report
-from .cli_common import DONE, NOT_CONVERGED, bounds, check_folders, command, hasten
-from .cli_scene import add_scene, save, task_of
+from .cli_common import DONE, NOT_CONVERGED, add_bounds, bounds, check_folders, command, hasten
+from .cli_scene import add_scene, model_between, save, task_of
 
 
 def add_reach(commands: Any) -> None:
@@ -24,10 +24,7 @@ def add_reach(commands: Any) -> None:
     )
     add_scene(parser)
     parser.add_argument("--target", metavar=("X", "Y", "Z"), nargs=3, type=float, required=True, help="place of the tip [m]")
-    parser.add_argument("--low", metavar="U", nargs="+", type=float, help="least inputs, one for all or one an actuator (default: 0)")
-    parser.add_argument(
-        "--high", metavar="U", nargs="+", type=float, help="greatest inputs (default: twice --inputs, or those of the file)"
-    )
+    add_bounds(parser, "twice --inputs, or those of the file")
     parser.add_argument("--json", metavar="FILE", help="save target, inputs, miss and the pose of the tip")
 
 
@@ -38,7 +35,7 @@ def _reach(options: argparse.Namespace) -> int:
     task = task_of(options)
     check_folders(options.json)
     low, high = bounds(options.low, options.high, 2 * np.asarray(task.inputs))
-    model = task.model if options.tolerance is None else _planned(task.scene, options.tolerance, low, high, task.inputs.dtype)
+    model = model_between(task, options.tolerance, low, high)
     found = reach(task.scene, jnp.asarray(options.target, task.inputs.dtype), (low, high), model=model)
     print("\n".join(report.lines(found.equilibrium, task.title or options.scene)))
     print(f"  inputs     {', '.join(f'{value:.6g}' for value in np.asarray(found.inputs))}")
@@ -53,9 +50,3 @@ def _reach(options: argparse.Namespace) -> int:
         }
         save(options.json, {"scene": options.scene, "title": task.title, **outcome})
     return DONE if bool(found.reached) else NOT_CONVERGED
-
-
-def _planned(scene: Any, tolerance: float, low: np.ndarray, high: np.ndarray, dtype: Any) -> Any:
-    from .plan import plan
-
-    return plan(scene, tolerance, (jnp.asarray(low, dtype), jnp.asarray(high, dtype))).model

@@ -7,17 +7,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from .basis import Basis, Legendre
-from .cli_common import DONE, NOT_CONVERGED, check_folders, command, hasten, positive
+from .cli_common import DONE, NOT_CONVERGED, add_precision, check_folders, command, hasten, positive, use
 from .discrete import Prescribed
 from .equilibrium import Equilibrium
 from .health import check
 from .model import Model
+from .plan import plan
 from .scene import Scene
 from .scenefile import load_scene
 from .solve import solve
@@ -93,7 +93,7 @@ def add_scene(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--steps", metavar="N", type=positive, help="steps along the arm (default: the model's)")
     parser.add_argument("--tolerance", metavar="M", type=float, help="as many steps as bring the tip within M metres, instead of --steps")
-    parser.add_argument("--precision", choices=("float64", "float32"), default="float64", help="of all numbers (default: %(default)s)")
+    add_precision(parser)
 
 
 class Task(NamedTuple):
@@ -110,8 +110,7 @@ def task_of(options: argparse.Namespace) -> Task:
 
     **Raises:** `ValueError` for a file or numbers that make no sense.
     """
-    if options.precision == "float64":
-        jax.config.update("jax_enable_x64", True)
+    use(options.precision)
     scene, inputs, title = load_scene(options.scene)
     inputs = inputs if options.inputs is None else options.inputs
     if inputs is None and scene.actuators:
@@ -121,6 +120,14 @@ def task_of(options: argparse.Namespace) -> Task:
     if options.tolerance is not None and (options.model, options.steps) != (None, None):
         raise ValueError("--tolerance: got --model or --steps too, need one or the other: a tolerance chooses both")
     return Task(scene, values, _model(options.model, options.steps, scene), title)
+
+
+def model_between(task: Task, tolerance: float | None, low: np.ndarray, high: np.ndarray) -> Model | None:
+    """The model asked for, or for inputs between two bounds the one that a tolerance takes."""
+    if tolerance is None:
+        return task.model
+    dtype = task.inputs.dtype
+    return plan(task.scene, tolerance, (low.astype(dtype), high.astype(dtype))).model
 
 
 def _solve(options: argparse.Namespace) -> int:
@@ -166,7 +173,7 @@ def _tell(eq: Equilibrium, title: str, options: argparse.Namespace) -> None:
         print(f"vsr-jax: {options.plot} is not drawn, there is no shape", file=sys.stderr)
 
 
-def save(path: str, content: dict[str, Any]) -> None:
+def save(path: str, content: Any) -> None:
     """Writes a JSON file."""
     Path(path).write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 

@@ -2,9 +2,7 @@
 `accuracy` what each digit costs."""
 
 import argparse
-import json
 import sys
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -12,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .cli_common import DONE, NOT_CONVERGED, check_folders, command, positive
-from .cli_scene import Task, task_of
+from .cli_scene import Task, save, task_of
 from .strain_dependent import StrainDependent
 
 _GROUPS = ("steps", "bases", "continuum")
@@ -99,8 +97,7 @@ def _effects(options: argparse.Namespace) -> int:
     )
     print("\n".join(effects.table(costs)))
     if options.json:
-        rows = [cost._asdict() for cost in costs]
-        Path(options.json).write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+        save(options.json, [cost._asdict() for cost in costs])
     return DONE if all(cost.converged == 1 for cost in costs) else NOT_CONVERGED
 
 
@@ -129,7 +126,7 @@ def _accuracy(options: argparse.Namespace) -> int:
     print("\n".join([*accuracy.table(rows), "", *accuracy.advice(rows)]))
     named = {task.title or options.scene: rows}
     if options.json:
-        Path(options.json).write_text(json.dumps(accuracy.records(named), indent=1) + "\n", encoding="utf-8")
+        save(options.json, {name: [row._asdict() for row in some] for name, some in named.items()})
     if options.plot:
         accuracy_figures.work_precision(named).savefig(options.plot, dpi=150)
     return DONE if any(row.tip is not None for row in rows) else NOT_CONVERGED

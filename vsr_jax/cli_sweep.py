@@ -8,9 +8,8 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from .cli_common import DONE, NOT_CONVERGED, bounds, check_folders, command, one_device_a_core, positive
-from .cli_scene import add_scene, task_of
-from .plan import plan
+from .cli_common import DONE, NOT_CONVERGED, add_bounds, bounds, check_folders, command, one_device_a_core, positive
+from .cli_scene import add_scene, model_between, task_of
 from .sweep import OUTPUTS, Sweep, sweep
 
 
@@ -28,8 +27,7 @@ def add_sweep(commands: Any) -> None:
     )
     add_scene(parser)
     parser.add_argument("--samples", metavar="N", type=positive, default=10_000, help="how many (default: %(default)s)")
-    parser.add_argument("--low", metavar="U", nargs="+", type=float, help="least inputs, one for all or one an actuator (default: 0)")
-    parser.add_argument("--high", metavar="U", nargs="+", type=float, help="greatest inputs (default: --inputs, or those of the file)")
+    add_bounds(parser, "--inputs, or those of the file")
     parser.add_argument("--seed", type=int, default=0, help="of the random numbers (default: %(default)s)")
     parser.add_argument("--outputs", nargs="+", choices=OUTPUTS, default=["tip"], help="what to keep besides the status (default: tip)")
     parser.add_argument("--out", metavar="DIR", help='a Zarr folder for inputs and outputs, which xarray reads; needs "vsr-jax[sweep]"')
@@ -43,7 +41,7 @@ def _sweep(options: argparse.Namespace) -> int:
     actuators, dtype = len(task.scene.actuators), task.inputs.dtype
     low, high = bounds(options.low, options.high, np.asarray(task.inputs))
     inputs = np.random.default_rng(options.seed).uniform(low, high, (options.samples, actuators)).astype(dtype)
-    model = task.model if options.tolerance is None else plan(task.scene, options.tolerance, (low.astype(dtype), high.astype(dtype))).model
+    model = model_between(task, options.tolerance, low, high)
     outputs = tuple(dict.fromkeys([*options.outputs, "tip"]))
     start = time.perf_counter()
     result = sweep(task.scene, inputs, outputs=outputs, model=model, out=options.out)

@@ -4,9 +4,10 @@ With inputs $u = u_0 + (u_1 - u_0) \sin^2(z / 2)$ between their bounds, z is fou
 
 $$\sum_j |x_j(z) - x_j^*|^2 / L^2 + w^2 \sum_i (\sin^2(z_i / 2) - s_i)^2$$
 
-least, where $s_i$ is the share at which the input is nearest to nothing: by damped Gauss-Newton steps (Levenberg-Marquardt of
-optimistix), for a weight w that falls to that of rounding. The second sum chooses the least effort among many solutions. The starts
-are the nearest of some inputs that are tried out first.
+least, where $s_i$ is the share at which the input is nearest to nothing: by damped Gauss-Newton steps (optimistix's dogleg
+within a trust region), for a weight w that falls to that of rounding. The second sum chooses the least effort among many
+solutions. The first start is the nearest of some inputs that are tried out beforehand; the next nearest follow where it does not
+lead to the target.
 """
 
 from typing import Any, NamedTuple
@@ -19,18 +20,22 @@ import optimistix
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from ._check import instance, is_traced, numbers, positive
+from . import bounded
+from ._check import instance, interval, numbers, positive
 from ._types import Scalar, cast
 from .equilibrium import Equilibrium
 from .model import Model
 from .scene import Scene
+from .se3 import rotation_vector
 from .solve import solve
 
 _TRIED, _STARTS, _STEPS = 512, 6, 40
 _WEIGHTS = (0.25, 0.5, 0.9)
 """Exponents of the machine's epsilon that give w."""
+_LAST_STEPS, _BESIDE = 200, 0.1
 _LOST = 10.0
-_INSIDE = 0.01
+_RADIUS = 0.1
+"""First radius of the trust region, in z. Near a bound, where z hardly moves the input, a whole Newton step would lead round it."""
 
 
 class Reach(NamedTuple):
@@ -110,18 +115,7 @@ class _Task(NamedTuple):
         if self.target.shape != (4, 4):
             return (places - self.target).reshape(-1)
         turn = self.target[:3, :3].T @ places[:3, :3]
-        return jnp.concatenate([places[:3, 3] - self.target[:3, 3], self.scene.rod.length * _angles(turn)])
-
-
-def _angles(turn: Array) -> Array:
-    """Rotation vector [rad] of a rotation matrix, smooth at the identity; at half a turn its length is right, its sign is not sure."""
-    axis = 0.5 * jnp.stack([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-    square = jnp.dot(axis, axis)
-    small = square < 1e-8
-    sine = jnp.sqrt(jnp.where(small, 1.0, square))
-    angle = jnp.arctan2(sine, (jnp.trace(turn) - 1) / 2)
-    near = jnp.trace(turn) > 1
-    return jnp.where(small & near, 1 + square / 6, angle / sine) * axis
+        return jnp.concatenate([places[:3, 3] - self.target[:3, 3], self.scene.rod.length * rotation_vector(turn)])
 
 
 def _check_shapes(target: Array, X: Array | None) -> None:
@@ -135,60 +129,84 @@ def _check_bounds(scene: Scene, bounds: Any, dtype: Any) -> tuple[Array, Array]:
     size = len(scene.actuators)
     if not size:
         raise ValueError("scene: got no actuators, need one at least")
-    if not isinstance(bounds, tuple | list) or len(bounds) != 2:
-        raise ValueError(f"bounds: got {bounds!r}, need a pair, the least and the greatest inputs")
-    pair = []
-    for i, bound in enumerate(bounds):
-        array = numbers(f"bounds[{i}]", bound, None)
-        if array.shape not in ((), (size,)):
-            raise ValueError(f"bounds[{i}]: got shape {array.shape}, need one number or {size}, one an actuator")
-        pair.append(jnp.broadcast_to(array, (size,)).astype(dtype))
-    low, high = pair
-    if is_traced(low) or is_traced(high):
-        return low, high
-    if np.any(np.asarray(low) > np.asarray(high)):
-        raise ValueError(f"bounds: got {np.asarray(low)} to {np.asarray(high)}, need the least inputs first")
+    low, high = interval("bounds", bounds, size)
     scene.check_inputs(low)
-    return low, high
+    return low.astype(dtype), high.astype(dtype)
 
 
 @eqx.filter_jit
 def _reach(task: _Task, allowed: Scalar) -> Reach:
-    size = task.low.size
-    tried = jnp.asarray(np.random.default_rng(0).uniform(size=(_TRIED, size)), task.low.dtype)
+    tried = jnp.asarray(np.random.default_rng(0).uniform(size=(_TRIED, task.low.size)), task.low.dtype)
     tried = jnp.concatenate([task.idle[None], tried])
     places = jax.vmap(lambda share: task.places(task.at(share)))(tried)  # of the scene alone: under vmap over targets these are solved once
     distance = jax.vmap(lambda x: jnp.linalg.norm(task.misses(x)))(places)
-    nearest = jnp.argsort(jnp.where(jnp.isfinite(distance), distance, jnp.inf))[:_STARTS]
-    shares = jax.vmap(lambda share: _descend(task, share))(tried[nearest])
-    effort = jnp.sum((shares - task.idle) ** 2, axis=1)
-    found = jax.vmap(task.at)(shares)
-    misses = jax.vmap(lambda eq: jnp.linalg.norm(task.misses(task.places(eq))))(found)
-    misses = jnp.where(jnp.isfinite(misses), misses, jnp.inf)
-    there = misses <= allowed
-    best = jnp.where(jnp.any(there), jnp.argmin(jnp.where(there, effort, jnp.inf)), jnp.argmin(misses))
-    arrays, rest = eqx.partition(found, eqx.is_array)
-    chosen = eqx.combine(jax.tree.map(lambda x: x[best], arrays), rest)
-    return Reach(task.inputs(shares[best]), chosen, misses[best], there[best])
+    share = _last(task, _searched(_still(task), lax.stop_gradient(_starts(tried, distance)), allowed))
+    found = task.at(share)
+    miss = jnp.linalg.norm(task.misses(task.places(found)))
+    miss = jnp.where(jnp.isfinite(miss), miss, jnp.inf)
+    return Reach(task.inputs(share), found, miss, miss <= allowed)
+
+
+def _starts(tried: Float[Array, "tried inputs"], distance: Float[Array, " tried"]) -> Float[Array, "starts inputs"]:
+    """The nearest, then the nearest of those that are not beside a start: the tip may pass by the target more than once."""
+    distance, starts = jnp.where(jnp.isfinite(distance), distance, jnp.inf), []
+    for _ in range(_STARTS):
+        starts.append(tried[jnp.argmin(distance)])
+        beside = jnp.linalg.norm(tried - starts[-1], axis=1) < _BESIDE * tried.shape[1] ** 0.5
+        distance = jnp.where(beside, jnp.inf, distance)
+    return jnp.stack(starts)
+
+
+def _searched(task: _Task, starts: Float[Array, "starts inputs"], allowed: Scalar) -> Array:
+    """Share of the range from the first start that leads there, or else from the one that leads nearest. Without derivatives."""
+
+    def pending(state: tuple[Array, Array, Array]) -> Array:
+        number, _, miss = state
+        return (number < len(starts)) & (miss > allowed)
+
+    def attempt(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        number, share, miss = state
+        new = _descend(task, starts[number])
+        there = jnp.linalg.norm(task.misses(task.places(task.at(new))))
+        nearer = there < miss
+        return number + 1, jnp.where(nearer, new, share), jnp.where(nearer, there, miss)
+
+    _, share, _ = lax.while_loop(pending, attempt, (jnp.array(0), starts[0], jnp.full_like(allowed, jnp.inf)))
+    return share
 
 
 def _descend(task: _Task, share: Array) -> Array:
-    """Share of the range at the least sum of squares, from a start."""
-    eps = float(jnp.finfo(share.dtype).eps)
-    numbers_, rest = eqx.partition(task, eqx.is_inexact_array)
-    solver = optimistix.Dogleg(rtol=eps**0.7, atol=eps**0.7)
+    """Share of the range at the least sum of squares, from a start, for one weight after another."""
 
-    def residual(z: Array, args: tuple[Any, Array]) -> Array:
+    def stage(z: Array, weight: Array) -> tuple[Array, None]:
+        return _least(task, z, weight, _STEPS), None
+
+    weights = jnp.asarray([jnp.finfo(share.dtype).eps ** power for power in _WEIGHTS], share.dtype)
+    return bounded.share(lax.scan(stage, bounded.at_share(share), weights)[0])
+
+
+def _last(task: _Task, share: Array) -> Array:
+    """The same share, with its derivatives: of the sum of squares with the last weight."""
+    z = 2 * jnp.arcsin(jnp.sqrt(share))
+    return bounded.share(_least(task, z, jnp.asarray(jnp.finfo(share.dtype).eps ** _WEIGHTS[-1], share.dtype), _LAST_STEPS))
+
+
+def _least(task: _Task, z: Array, weight: Array, steps: int) -> Array:
+    """Where the sum of squares is least, near z."""
+    eps = float(jnp.finfo(z.dtype).eps)
+    numbers_, rest = eqx.partition(task, eqx.is_inexact_array)
+    solver = optimistix.Dogleg(rtol=eps**0.7, atol=eps**1.4)  # also of the sum, which is a square
+
+    def residual(y: Array, args: tuple[Any, Array]) -> Array:
         here = eqx.combine(args[0], rest)
-        part = jnp.sin(z / 2) ** 2
+        part = bounded.share(_RADIUS * y)
         missed = here.misses(here.places(here.at(part))) / here.scene.rod.length
         return jnp.concatenate([jnp.where(jnp.isfinite(missed), missed, _LOST), args[1] * (part - here.idle)])
 
-    def stage(z: Array, weight: Array) -> tuple[Array, None]:
-        found = optimistix.least_squares(residual, solver, z, (numbers_, weight), max_steps=_STEPS, throw=False)
-        return found.value, None
+    found = optimistix.least_squares(residual, solver, z / _RADIUS, (numbers_, weight), max_steps=steps, throw=False)
+    return _RADIUS * found.value
 
-    start = 2 * jnp.arcsin(jnp.sqrt(jnp.clip(share, _INSIDE, 1 - _INSIDE)))
-    weights = jnp.asarray([eps**power for power in _WEIGHTS], share.dtype)
-    z, _ = lax.scan(stage, start, weights)
-    return jnp.sin(z / 2) ** 2
+
+def _still(task: _Task) -> _Task:
+    arrays, rest = eqx.partition(task, eqx.is_inexact_array)
+    return eqx.combine(lax.stop_gradient(arrays), rest)

@@ -5,6 +5,7 @@ traced. The reference of each trial is the same arm with as many steps as there 
 room for four times as many in the next.
 """
 
+from itertools import product
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -14,7 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ._check import instance, is_traced, numbers, positive
+from ._check import instance, interval, is_traced, positive
 from ._types import cast
 from .balance import forces_where
 from .model import Status, resolved
@@ -123,28 +124,18 @@ def _worst(errors: np.ndarray) -> np.ndarray:
 
 def _samples(scene: Scene, inputs_range: Any) -> Array:
     """Corners of the range, as many as there is room for, and inputs between them."""
-    if not isinstance(inputs_range, tuple | list) or len(inputs_range) != 2:
-        raise ValueError(f"inputs_range: got {inputs_range!r}, need a pair, the least and the greatest inputs")
     size = len(scene.actuators)
-    low, high = (_bound(f"inputs_range[{i}]", bound, size) for i, bound in enumerate(inputs_range))
+    low, high = interval("inputs_range", inputs_range, size)
     scene.check_inputs(low)
     scene.check_inputs(high)
-    if np.any(np.asarray(low > high)):
-        raise ValueError(f"inputs_range: got {low} to {high}, need the least inputs first")
     random = np.random.default_rng(0)
-    corners = np.stack(np.meshgrid(*[[0.0, 1.0]] * size, indexing="ij"), axis=-1).reshape(-1, size) if size <= 10 else np.zeros((0, size))
-    if len(corners) > _SAMPLES // 2 or size > 10:
+    if 2**size <= _SAMPLES // 2:
+        corners = np.array(list(product((0.0, 1.0), repeat=size)))
+    else:
         corners = np.concatenate([np.zeros((1, size)), np.ones((1, size)), random.integers(0, 2, (_SAMPLES // 2, size))])
     between = random.uniform(size=(_SAMPLES - len(corners), size))
     share = jnp.asarray(np.concatenate([corners, between]), low.dtype)
     return low + share * (high - low)
-
-
-def _bound(name: str, bound: Any, size: int) -> Array:
-    array = numbers(name, bound, None)
-    if array.shape not in ((), (size,)):
-        raise ValueError(f"{name}: got shape {array.shape}, need one number or {size}, one an actuator")
-    return jnp.broadcast_to(array, (size,))
 
 
 def _rounding(scene: Scene, samples: Array, model: StrainDependent) -> float:

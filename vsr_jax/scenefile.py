@@ -103,12 +103,19 @@ def parse_scene(text: str) -> SceneFile:
 
     **Raises:** `ValueError` as `load_scene`, without the file's name.
     """
-    table = tomllib.loads(text)
-    _check_keys(Scene, table, "", _FILE_KEYS)
-    title, inputs = table.pop("title", ""), table.pop("inputs", None)
+    return parse_table(tomllib.loads(text), "")
+
+
+def parse_table(table: dict[str, Any], path: str) -> SceneFile:
+    """The scene in a table of a TOML file, which lies there under `path`.
+
+    **Raises:** `ValueError` as `load_scene`, without the file's name.
+    """
+    check_keys(Scene, table, path, _FILE_KEYS)
+    title, inputs = table.get("title", ""), table.get("inputs")
     if not isinstance(title, str):
-        raise ValueError(f"title: got {title!r}, need text")
-    scene = _build(Scene, table, "")
+        raise ValueError(at(path, f"title: got {title!r}, need text"))
+    scene = _build(Scene, {key: value for key, value in table.items() if key not in _FILE_KEYS}, path)
     return SceneFile(scene, None if inputs is None else scene.check_inputs(inputs), title)
 
 
@@ -141,14 +148,15 @@ def _read(value: Any, path: str, group: Group) -> Any:
     if isinstance(value, list):
         return [_read(item, f"{path}[{i}]", group) for i, item in enumerate(value)]
     if isinstance(value, dict):
-        kind = _kind(value, path, group)
+        kind = kind_of(value, path, group)
         return _build(kind, {key: item for key, item in value.items() if key != "type"}, path)
     if group is not _PROFILES:
         raise ValueError(f"{path}: got {value!r}, need a table of the type {' or '.join(sorted(group))}")
     return value
 
 
-def _kind(table: dict[str, Any], path: str, group: Group) -> type:
+def kind_of(table: dict[str, Any], path: str, group: Group) -> type:
+    """The class that a table names in its `type`, one of a group."""
     known = ", ".join(sorted(group))
     if "type" not in table:
         if len(group) == 1:
@@ -161,23 +169,24 @@ def _kind(table: dict[str, Any], path: str, group: Group) -> type:
 
 
 def _build(kind: type, table: dict[str, Any], path: str) -> Any:
-    _check_keys(kind, table, path)
+    check_keys(kind, table, path)
     arguments = {key: _read(value, _below(path, key), _GROUPS.get(key, _PROFILES)) for key, value in table.items()}
     try:
         return kind(**arguments)
     except (ValueError, TypeError, OverflowError) as error:
-        raise ValueError(_at(path, " ".join(str(error).split()))) from None
+        raise ValueError(at(path, " ".join(str(error).split()))) from None
 
 
-def _check_keys(kind: type, table: dict[str, Any], path: str, more: tuple[str, ...] = ()) -> None:
+def check_keys(kind: type, table: dict[str, Any], path: str, more: tuple[str, ...] = ()) -> None:
+    """Refuses keys that are no arguments of a class, and missing ones that are."""
     parameters = inspect.signature(kind).parameters
     known = sorted((*parameters, *more))
     for key in table:
         if key not in known:
-            raise ValueError(_at(path, f"unknown key {key!r}, known are {', '.join(known)}{_guess(key, known)}"))
+            raise ValueError(at(path, f"unknown key {key!r}, known are {', '.join(known)}{_guess(key, known)}"))
     for name, parameter in parameters.items():
         if parameter.default is parameter.empty and name not in table:
-            raise ValueError(_at(path, f"missing key {name!r}, known are {', '.join(known)}"))
+            raise ValueError(at(path, f"missing key {name!r}, known are {', '.join(known)}"))
 
 
 def _guess(name: Any, known: Any) -> str:
@@ -190,7 +199,8 @@ def _below(path: str, key: str) -> str:
     return f"{path}.{key}" if path else key
 
 
-def _at(path: str, message: str) -> str:
+def at(path: str, message: str) -> str:
+    """A message that begins with where it belongs."""
     return f"{path}: {message}" if path else message
 
 

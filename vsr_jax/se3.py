@@ -139,6 +139,20 @@ def inverse(g: Pose) -> Pose:
     return jnp.concatenate([top, g[3:]])
 
 
+def rotation_vector(rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    r"""Axis times angle [rad] of a rotation, $\theta$ with $R = \exp \tilde\theta$, $|\theta| \le \pi$.
+
+    Smooth at the identity; at half a turn its length is right and its sign is not sure.
+    """
+    axis = 0.5 * jnp.stack([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
+    square = jnp.dot(axis, axis)
+    small = square < 1e-8
+    sine = jnp.sqrt(jnp.where(small, 1.0, square))
+    angle = jnp.arctan2(sine, (jnp.trace(rotation) - 1) / 2)
+    near = jnp.trace(rotation) > 1
+    return jnp.where(small & near, 1 + square / 6, angle / sine) * axis
+
+
 def _blocks(a: Array, b: Array, c_: Array, d: Array) -> Float[Array, "6 6"]:
     return jnp.concatenate([jnp.concatenate([a, b], axis=1), jnp.concatenate([c_, d], axis=1)])
 

@@ -47,7 +47,7 @@ def solve(scene: Scene, inputs: Any, *, model: Model | None = None, tolerance: f
     values = scene.check_inputs(inputs)
     chosen = _model(scene, values, model, tolerance)
     scene, chosen = cast((scene, chosen), values.dtype)
-    equilibrium = Equilibrium(scene, values, chosen, _solve(scene, values, chosen))
+    equilibrium = Equilibrium(scene, values, chosen, outcome_of(scene, values, chosen))
     return _raise_if_failed(equilibrium) if throw else equilibrium
 
 
@@ -61,7 +61,8 @@ def _model(scene: Scene, inputs: Array, model: Model | None, tolerance: float | 
 
 
 @eqx.filter_jit
-def _solve(scene: Scene, inputs: Float[Array, " inputs"], model: Model) -> Outcome:
+def outcome_of(scene: Scene, inputs: Float[Array, " inputs"], model: Model) -> Outcome:
+    """What a model makes of inputs, those that an actuator cannot exert refused by their status; all in one precision."""
     finite, admitted = jnp.all(jnp.isfinite(inputs)), scene.admits(inputs)
     outcome = resolved(model, scene, model.solve(scene, jnp.where(finite & admitted, inputs, 0.0)))
     status = jnp.where(admitted, outcome.status, Status.INADMISSIBLE)

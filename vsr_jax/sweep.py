@@ -1,12 +1,10 @@
 """Many equilibria at once: any number of samples, in chunks, over all devices and processes, to memory or to disk."""
 
-import hashlib
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, TypeAlias
 
-import equinox as eqx
 import jax
 import numpy as np
 from jax.sharding import Mesh
@@ -15,6 +13,7 @@ from tqdm import tqdm
 from ._check import count
 from .archive import Archive, InMemory
 from .equilibrium import Equilibrium
+from .fingerprint import fingerprint
 from .model import Model, Status
 from .parallel import Program, Task, number
 from .scene import Scene
@@ -173,12 +172,4 @@ def _flat(samples: Any) -> dict[str, np.ndarray]:
 
 
 def _digest(task: Task, samples: Any) -> str:
-    """A hash of what is computed, as JAX sees it, and of all numbers that go in."""
-    arrays, static = eqx.partition(task, eqx.is_array)
-    one = jax.tree.map(lambda x: x[0], samples)
-    program = jax.make_jaxpr(lambda arrays, sample: eqx.combine(arrays, static)(sample))(arrays, one)
-    text = re.sub(r" at 0x[0-9a-f]+", "", str(program.jaxpr))
-    digest = hashlib.sha256(text.encode())
-    for leaf in jax.tree.leaves((program.consts, arrays, samples)):
-        digest.update(np.asarray(leaf).tobytes())
-    return digest.hexdigest()
+    return fingerprint(task, (jax.tree.map(lambda x: x[0], samples),), samples)

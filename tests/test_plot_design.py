@@ -1,0 +1,151 @@
+"""Pictures of designs, films, what is drawn onto arms; problems of design as files and the command that reads them."""
+
+import json
+
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+import vsr_jax as vsr
+from vsr_jax import annotate, cli, cli_design, film, plot, plot_design
+from vsr_jax.designfile import load_design
+from vsr_jax.scenefile import load_scene
+
+MODEL = vsr.StrainDependent(6)
+PROBLEM = """
+title = "A thread to one place"
+inputs = [[2.0]]
+steps = 4
+starts = 2
+tried = 2
+
+[scene]
+free_strains = ["bending_z"]
+
+[scene.rod]
+length = 0.3
+section = { type = "Circular", radius = 0.01 }
+material = { young = 8e5, poisson = 0.45 }
+
+[[scene.actuators]]
+type = "Tendon"
+routing = { type = "Parallel", y = 0.004, z = 0.0 }
+
+[free]
+"actuators[0].routing.y" = [0.001, 0.009]
+inputs = [0.5, 4.0]
+
+[[objectives]]
+type = "TipError"
+targets = [[0.28, 0.05, 0.0]]
+
+[[objectives]]
+type = "Tension"
+weight = 1e-6
+scale = 5.0
+
+[[constraints]]
+type = "Inside"
+wall = 0.001
+"""
+
+
+@pytest.fixture(scope="module")
+def eq():
+    arm = vsr.Rod(0.3, vsr.Circular(0.01), vsr.Material(8e5, poisson=0.45, density=1000.0))
+    loads = [vsr.Gravity(), vsr.TipWrench(force=(0.0, 0.0, 0.02), frame="body")]
+    return vsr.solve(vsr.Scene(arm, [vsr.Tendon(vsr.Parallel(0.005, 0.0))], loads), jnp.array([1.0]), model=MODEL)
+
+
+@pytest.fixture
+def problem(tmp_path):
+    path = tmp_path / "problem.toml"
+    path.write_text(PROBLEM)
+    return path
+
+
+@pytest.fixture(autouse=True)
+def closed():
+    yield
+    plt.close("all")
+
+
+def arrows(ax):
+    """Number of lines of every bundle of arrows in 3D axes."""
+    return [len(bundle._segments3d) for bundle in ax.collections if hasattr(bundle, "_segments3d")]
+
+
+def test_frames_and_loads_are_drawn_onto_an_arm(eq):
+    ax = annotate.frames(eq, plot.arm(eq), stations=5)
+    assert arrows(ax) == [15, 15, 15]  # a shaft and two lines of a head each
+    loaded = annotate.loads(eq)
+    assert len(loaded.collections) == 2  # twelve arrows of weight, one at the tip
+    assert loaded.zz_dataLim.x0 < -0.26  # all of them in the picture, with their ends
+    assert loaded.zz_dataLim.x1 > -0.001
+    weight, tip = annotate._forces(eq, 0.3)
+    np.testing.assert_allclose(weight[1], [[0, 0, -9.81 * 1000 * np.pi * 1e-4]] * 12, rtol=1e-6)
+    np.testing.assert_allclose(tip[1][0], 0.02 * np.asarray(eq.tip)[:3, 2], rtol=1e-6)
+
+
+def test_an_ellipsoid_has_the_size_it_says():
+    ax = annotate.ellipsoid(vsr.Ellipsoid(jnp.array([1.0, 0.0, 0.0]), jnp.diag(jnp.array([0.5, 0.2, 0.1]))), scale=2.0)
+    np.testing.assert_allclose(ax.xy_dataLim.intervalx, (0.0, 2.0), atol=1e-3)
+    np.testing.assert_allclose(ax.xy_dataLim.intervaly, (-0.4, 0.4), atol=1e-3)
+
+
+def test_a_film_has_a_frame_for_each_arm(eq, tmp_path):
+    moving = film.film([eq, eq, eq], tmp_path / "arm.gif", titles=["a", "b", "c"], seconds=1.0, dots=30)
+    assert moving is not None
+    assert plt.imread(tmp_path / "arm.gif").ndim == 3
+    with pytest.raises(ValueError, match="equilibria: got none"):
+        film.film([])
+    with pytest.raises(ValueError, match="titles: got 1, need 2"):
+        film.film([eq, eq], titles=["a"])
+
+
+def test_a_problem_file_is_designed_kept_and_drawn(problem, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(cli_design, "hasten", lambda optimise: None)
+    out, record, picture = (tmp_path / name for name in ("designed.toml", "design.json", "design.png"))
+    code = cli.main(["design", str(problem), "--out", str(out), "--json", str(record), "--plot", str(picture)])
+    said = capsys.readouterr().out
+    assert code == 0
+    assert "Inside(wall=0.001): kept" in said
+    assert "actuators[0].routing.y = " in said
+    kept, told = load_scene(out), json.loads(record.read_text())
+    assert float(kept.scene.actuators[0].routing.y) == pytest.approx(told["numbers"]["actuators[0].routing.y"])
+    assert kept.inputs.tolist() == pytest.approx(told["inputs"][0])
+    assert told["feasible"]
+    assert len(told["starts"]) == 2
+    assert picture.stat().st_size > 10_000
+
+
+def test_a_history_marks_the_one_that_was_chosen(problem):
+    task = load_design(problem)
+    found = vsr.design(task.scene, task.free, task.objective, task.inputs, progress=False, **task.settings)
+    lines = plot_design.history(found).get_lines()
+    assert [line.get_label() for line in lines][-1] == "chosen"
+    assert np.nanmin(lines[-1].get_ydata()) == pytest.approx(found.objective)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("[free]", "[fre]", "unknown key 'fre'"),
+        ('type = "TipError"', 'type = "TipEror"', r"objectives\[0\]: unknown type 'TipEror'.*did you mean 'TipError'"),
+        ("wall = 0.001", "wal = 0.001", r"constraints\[0\]: unknown key 'wal'"),
+        ("wall = 0.001", "wall = -1.0", r"constraints\[0\]: Inside.wall: got -1"),
+        ("young = 8e5", "young = -8e5", "young"),
+        ("inputs = [[2.0]]", "", "missing key 'inputs'"),
+    ],
+)
+def test_errors_of_problem_files_name_file_and_place(unchecked, problem, old, new, message):
+    problem.write_text(PROBLEM.replace(old, new, 1))
+    with pytest.raises(ValueError, match=rf"problem.toml: .*{message}"):
+        load_design(problem)
+
+
+def test_what_the_command_refuses_is_one_line(problem, capsys):
+    problem.write_text(PROBLEM.replace("[0.001, 0.009]", "[0.009, 0.001]"))
+    assert cli.main(["design", str(problem)]) == 2
+    assert capsys.readouterr().err.startswith("vsr-jax: free['actuators[0].routing.y']: got [0.009, 0.001], need the least value first")

@@ -1,0 +1,132 @@
+"""How a tip moves with numbers, inputs and wrenches: against differences of other solves, and beams that are known."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vsr_jax as vsr
+from vsr_jax.parameters import replaced
+
+MODEL, FINER = vsr.StrainDependent(8), vsr.StrainDependent(12)
+LENGTH = 0.3
+
+
+@pytest.fixture(scope="module")
+def eq():
+    arm = vsr.Rod(LENGTH, vsr.Circular(vsr.Taper(0.012, 0.010)), vsr.Material(8e5, poisson=0.45))
+    threads = [vsr.Tendon(vsr.Helix(0.006, 1.5)), vsr.Tendon(vsr.Parallel(0.0, -0.006)), vsr.Tendon(vsr.Polynomial([0.001, 0.01], [0.005]))]
+    return vsr.solve(vsr.Scene(arm, threads), jnp.array([4.0, 2.0, 1.0]), model=MODEL)
+
+
+@pytest.fixture(scope="module")
+def table(eq):
+    return vsr.sensitivity(eq)
+
+
+@pytest.fixture(scope="module")
+def tip_of():
+    return jax.jit(lambda scene, inputs: vsr.solve(scene, inputs, model=FINER).tip)
+
+
+def motion(ahead, behind, step):
+    """Turn and displacement by a number, from poses a step to both sides of it."""
+    turn = (ahead[:3, :3] - behind[:3, :3]) / (2 * step) @ (0.5 * (ahead[:3, :3] + behind[:3, :3])).T
+    turn = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    return turn, (ahead[:3, 3] - behind[:3, 3]) / (2 * step)
+
+
+@pytest.mark.parametrize("name", ["rod.material.young", "rod.section.radius.tip", "actuators[0].routing.angle", "actuators[1].routing.z"])
+def test_rows_are_differences_of_finer_solves(eq, table, tip_of, name):
+    value = float(vsr.parameters(eq.scene)[name].value)
+    step = 1e-5 * abs(value)
+    ahead, behind = (np.asarray(tip_of(replaced(eq.scene, {name: jnp.array(value + d)}), eq.inputs)) for d in (step, -step))
+    turn, place = motion(ahead, behind, step)
+    row = table[name]
+    np.testing.assert_allclose(row.place, place, atol=2e-6 * np.linalg.norm(place))
+    np.testing.assert_allclose(row.turn, turn, atol=2e-6 * np.linalg.norm(turn))
+
+
+def test_inputs_are_rows_too_and_the_jacobian_has_them(eq, table, tip_of):
+    J = vsr.tip_jacobian(eq)
+    for i in range(3):
+        step = np.eye(3)[i] * 1e-4
+        ahead, behind = (np.asarray(tip_of(eq.scene, eq.inputs + sign * step)) for sign in (1, -1))
+        np.testing.assert_allclose(J[:, i], np.concatenate(motion(ahead, behind, 1e-4)), atol=1e-6 * np.abs(J).max())
+        np.testing.assert_allclose(table[f"inputs[{i}]"].place, J[3:, i], atol=1e-12)
+    assert table["inputs[0]"].unit == "N"
+
+
+def test_the_table_reads_well(table):
+    text = str(table)
+    assert "actuators[2].routing.y[1]" in text
+    assert len(text.splitlines()) == 2 + len(table.names)
+    with pytest.raises(KeyError, match="known are"):
+        table["rod.lenght"]
+
+
+def test_compliance_of_a_straight_beam_is_the_textbooks():
+    """Timoshenko's cantilever: L^3 / 3EI + L / kGA across, L / EA along, L / GJ in torsion, L^2 / 2EI between."""
+    arm = vsr.Rod(LENGTH, vsr.Circular(0.01), vsr.Material(8e5, shear=3e5))
+    scene = vsr.Scene(arm, [vsr.Thread(vsr.Parallel(0.0, 0.0))])
+    C = np.asarray(vsr.compliance(vsr.solve(scene, jnp.zeros(1), model=MODEL)))
+    S = [float(x) for x in arm.stiffness(jnp.array(0.0))]
+    expected = np.zeros((6, 6))
+    expected[range(3), range(3)] = [LENGTH / S[0], LENGTH / S[1], LENGTH / S[2]]
+    expected[3, 3] = LENGTH / S[3]
+    expected[4, 4] = LENGTH**3 / (3 * S[2]) + LENGTH / S[4]
+    expected[5, 5] = LENGTH**3 / (3 * S[1]) + LENGTH / S[5]
+    expected[2, 4] = expected[4, 2] = LENGTH**2 / (2 * S[2])
+    expected[1, 5] = expected[5, 1] = -(LENGTH**2) / (2 * S[1])
+    np.testing.assert_allclose(C, expected, atol=1e-12 * np.abs(expected).max())
+
+
+def test_compliance_is_what_a_small_wrench_does(eq):
+    """The quadrature along a bent arm against solves under a wrench, which take another way altogether."""
+    C = vsr.compliance(eq)
+    pushed = jax.jit(
+        lambda w: vsr.solve(vsr.Scene(eq.scene.rod, eq.scene.actuators, [vsr.TipWrench(w[3:], w[:3])]), eq.inputs, model=FINER).tip
+    )
+    for i, step in ((1, 1e-5), (4, 1e-4)):
+        ahead, behind = (np.asarray(pushed(jnp.asarray(sign * step * np.eye(6)[i]))) for sign in (1, -1))
+        np.testing.assert_allclose(C[:, i], np.concatenate(motion(ahead, behind, step)), atol=1e-4 * np.abs(C[:, i]).max())
+    np.testing.assert_allclose(C, C.T, atol=1e-9 * np.abs(C).max())
+
+
+@pytest.mark.slow
+def test_compliance_under_loads_and_of_a_basis(eq):
+    scene = vsr.Scene(eq.scene.rod, eq.scene.actuators, [vsr.TipWrench(force=(0.0, 0.0, -0.01))])
+    models = (MODEL, vsr.Prescribed(vsr.Basis.uniform(vsr.Legendre(4))))
+    loaded, other = (np.asarray(vsr.compliance(vsr.solve(scene, eq.inputs, model=model))) for model in models)
+    np.testing.assert_allclose(loaded, other, atol=1e-3 * np.abs(loaded).max())
+    np.testing.assert_allclose(loaded, loaded.T, atol=0.02 * np.abs(loaded).max())
+
+
+def test_ellipsoids(eq):
+    J = np.asarray(vsr.tip_jacobian(eq))[3:]
+    found = vsr.manipulability(eq, 2.0)
+    np.testing.assert_allclose(found.measure, np.sqrt(np.linalg.det(4 * J @ J.T)), rtol=1e-9)
+    np.testing.assert_allclose(found.axes @ found.axes.T, 4 * J @ J.T, atol=1e-12)
+    np.testing.assert_allclose(found.centre, eq.tip[:3, 3])
+    softest = vsr.compliance_ellipsoid(eq)
+    np.testing.assert_allclose(np.linalg.norm(softest.axes[:, 0]), np.linalg.norm(vsr.compliance(eq)[3:, 3:], 2), rtol=1e-9)
+
+
+def test_under_vmap_jit_and_grad_and_in_single_precision(eq):
+    scene = eq.scene.astype(jnp.float32)
+
+    def measure(inputs):
+        return jnp.sum(vsr.tip_jacobian(vsr.solve(scene, inputs, model=MODEL))[3:] ** 2)
+
+    inputs = jnp.array([[4.0, 2.0, 1.0], [1.0, 0.0, 3.0]], jnp.float32)
+    slopes = jax.jit(jax.vmap(jax.grad(measure)))(inputs)
+    assert slopes.dtype == jnp.float32
+    assert np.all(np.isfinite(slopes))
+    rows = jax.vmap(lambda u: vsr.sensitivity(vsr.solve(scene, u, model=MODEL)))(inputs)
+    assert rows.place.shape == (2, len(rows.names), 3)
+
+
+def test_a_failed_solve_has_none(eq):
+    failed = vsr.solve(eq.scene, jnp.array([1e6, 0.0, 0.0]), model=MODEL)
+    assert np.all(np.isnan(vsr.tip_jacobian(failed)))
+    assert np.all(np.isnan(vsr.compliance(failed)))
