@@ -184,7 +184,7 @@ def main() -> None:
     done: dict[str, Any] = content["scenes"]
     for name in options.scenes:
         if name not in done:
-            done[name] = accuracy.records({name: run(name, options.lanes)})[name]
+            done[name] = [row._asdict() for row in run(name, options.lanes)]
             if file:
                 file.write_text(json.dumps(content, indent=1) + "\n")
     for title, measured in (("asked for on B2", asked_for), ("price of an estimate", estimates), ("stiff solver on B2", stiff)):
