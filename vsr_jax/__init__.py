@@ -24,6 +24,7 @@ from .discrete import (
 from .equilibrium import Equilibrium as Equilibrium
 from .estimate import Error as Error
 from .health import Health as Health, check as check
+from .inverse import Reach as Reach, reach as reach
 from .kinematics import step_twist as step_twist, zanna_step as zanna_step
 from .load import (
     DistributedWrench as DistributedWrench,
@@ -75,14 +76,13 @@ from .sweep import Sweep as Sweep, sweep as sweep
 
 if TYPE_CHECKING:
     from .continuum import Continuum as Continuum
-    from .inverse import Reach as Reach, reach as reach
     from .optimize import Design as Design, design as design
 
 __version__ = "0.1.0"
 
 
-_LATER = {"Continuum": "continuum", "Reach": "inverse", "reach": "inverse", "Design": "optimize", "design": "optimize"}
-"""Where names lie that only some programs need: diffrax, optimistix and optax take a third of the import time."""
+_LATER = {"Continuum": "continuum", "Design": "optimize", "design": "optimize"}
+"""Where names lie that only some programs need: diffrax and optax take a third of the import time."""
 
 
 def __getattr__(name: str) -> Any:

@@ -1,13 +1,12 @@
 r"""Inverse statics: the inputs that bring an arm's tip, or points along it, to where they are wanted.
 
-With inputs $u = u_0 + (u_1 - u_0) \sin^2(z / 2)$ between their bounds, z is found that makes
+With inputs $u = u_0 + (u_1 - u_0) s$ between their bounds, $0 \le s_i \le 1$, the shares s are found that make
 
-$$\sum_j |x_j(z) - x_j^*|^2 / L^2 + w^2 \sum_i (\sin^2(z_i / 2) - s_i)^2$$
+$$\sum_j |x_j(s) - x_j^*|^2 / L^2 + w^2 \sum_i (s_i - s_{0i})^2$$
 
-least, where $s_i$ is the share at which the input is nearest to nothing: by damped Gauss-Newton steps (optimistix's dogleg
-within a trust region), for a weight w that falls to that of rounding. The second sum chooses the least effort among many
-solutions. The first start is the nearest of some inputs that are tried out beforehand; the next nearest follow where it does not
-lead to the target.
+least for a weight w that falls to nothing, where $s_0$ is the share at which an input is nearest to nothing (see `box`). The second
+sum chooses the least effort among many solutions. The first start is the nearest of some inputs that are tried out beforehand;
+the next nearest follow where it does not lead to the target. Derivatives are those of the condition for the least sum.
 """
 
 from typing import Any, NamedTuple
@@ -16,11 +15,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from . import bounded
+from . import box
 from ._check import instance, interval, numbers, positive
 from ._types import Scalar, cast
 from .equilibrium import Equilibrium
@@ -29,13 +27,9 @@ from .scene import Scene
 from .se3 import rotation_vector
 from .solve import solve
 
-_TRIED, _STARTS, _STEPS = 512, 6, 40
-_WEIGHTS = (0.25, 0.5, 0.9)
-"""Exponents of the machine's epsilon that give w."""
-_LAST_STEPS, _BESIDE = 200, 0.1
-_LOST = 10.0
-_RADIUS = 0.1
-"""First radius of the trust region, in z. Near a bound, where z hardly moves the input, a whole Newton step would lead round it."""
+_TRIED, _STARTS = 512, 6
+_BESIDE = 0.1
+"""Distance, by the diagonal of the box of shares, within which inputs tried out lead to the same place."""
 
 
 class Reach(NamedTuple):
@@ -117,6 +111,10 @@ class _Task(NamedTuple):
         turn = self.target[:3, :3].T @ places[:3, :3]
         return jnp.concatenate([places[:3, 3] - self.target[:3, 3], self.scene.rod.length * rotation_vector(turn)])
 
+    def missed(self, share: Array) -> Array:
+        """What is missed at a share of the way, by the arm's length."""
+        return self.misses(self.places(self.at(share))) / self.scene.rod.length
+
 
 def _check_shapes(target: Array, X: Array | None) -> None:
     if X is None and target.shape not in ((3,), (4, 4)):
@@ -140,11 +138,13 @@ def _reach(task: _Task, allowed: Scalar) -> Reach:
     tried = jnp.concatenate([task.idle[None], tried])
     places = jax.vmap(lambda share: task.places(task.at(share)))(tried)  # of the scene alone: under vmap over targets these are solved once
     distance = jax.vmap(lambda x: jnp.linalg.norm(task.misses(x)))(places)
-    share = _last(task, _searched(_still(task), lax.stop_gradient(_starts(tried, distance)), allowed))
-    found = task.at(share)
-    miss = jnp.linalg.norm(task.misses(task.places(found)))
+    still = _still(task)
+    found = box.nearest(still.missed, lax.stop_gradient(_starts(tried, distance)), still.idle, allowed / still.scene.rod.length)
+    share = _moving(task, found)
+    there = task.at(share)
+    miss = jnp.linalg.norm(task.misses(task.places(there)))
     miss = jnp.where(jnp.isfinite(miss), miss, jnp.inf)
-    return Reach(task.inputs(share), found, miss, miss <= allowed)
+    return Reach(task.inputs(share), there, miss, miss <= allowed)
 
 
 def _starts(tried: Float[Array, "tried inputs"], distance: Float[Array, " tried"]) -> Float[Array, "starts inputs"]:
@@ -157,54 +157,21 @@ def _starts(tried: Float[Array, "tried inputs"], distance: Float[Array, " tried"
     return jnp.stack(starts)
 
 
-def _searched(task: _Task, starts: Float[Array, "starts inputs"], allowed: Scalar) -> Array:
-    """Share of the range from the first start that leads there, or else from the one that leads nearest. Without derivatives."""
+def _moving(task: _Task, found: box.Nearest) -> Array:
+    """The share found, with its derivatives: those of where the slope of the sum with the last weight is nothing."""
 
-    def pending(state: tuple[Array, Array, Array]) -> Array:
-        number, _, miss = state
-        return (number < len(starts)) & (miss > allowed)
+    def half(share: Array) -> Array:
+        effort = box.weight(share.dtype) * (share - task.idle)
+        return (jnp.sum(task.missed(share) ** 2) + jnp.sum(effort**2)) / 2
 
-    def attempt(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        number, share, miss = state
-        new = _descend(task, starts[number])
-        there = jnp.linalg.norm(task.misses(task.places(task.at(new))))
-        nearer = there < miss
-        return number + 1, jnp.where(nearer, new, share), jnp.where(nearer, there, miss)
+    def slope(share: Array) -> Array:
+        return jnp.where(found.free, jax.grad(half)(share), share - found.regular)
 
-    _, share, _ = lax.while_loop(pending, attempt, (jnp.array(0), starts[0], jnp.full_like(allowed, jnp.inf)))
-    return share
+    def back(linear: Any, slope: Array) -> Array:
+        return jnp.linalg.solve(jax.jacobian(linear)(slope), slope)
 
-
-def _descend(task: _Task, share: Array) -> Array:
-    """Share of the range at the least sum of squares, from a start, for one weight after another."""
-
-    def stage(z: Array, weight: Array) -> tuple[Array, None]:
-        return _least(task, z, weight, _STEPS), None
-
-    weights = jnp.asarray([jnp.finfo(share.dtype).eps ** power for power in _WEIGHTS], share.dtype)
-    return bounded.share(lax.scan(stage, bounded.at_share(share), weights)[0])
-
-
-def _last(task: _Task, share: Array) -> Array:
-    """The same share, with its derivatives: of the sum of squares with the last weight."""
-    z = 2 * jnp.arcsin(jnp.sqrt(share))
-    return bounded.share(_least(task, z, jnp.asarray(jnp.finfo(share.dtype).eps ** _WEIGHTS[-1], share.dtype), _LAST_STEPS))
-
-
-def _least(task: _Task, z: Array, weight: Array, steps: int) -> Array:
-    """Where the sum of squares is least, near z."""
-    eps = float(jnp.finfo(z.dtype).eps)
-    numbers_, rest = eqx.partition(task, eqx.is_inexact_array)
-    solver = optimistix.Dogleg(rtol=eps**0.7, atol=eps**1.4)  # also of the sum, which is a square
-
-    def residual(y: Array, args: tuple[Any, Array]) -> Array:
-        here = eqx.combine(args[0], rest)
-        part = bounded.share(_RADIUS * y)
-        missed = here.misses(here.places(here.at(part))) / here.scene.rod.length
-        return jnp.concatenate([jnp.where(jnp.isfinite(missed), missed, _LOST), args[1] * (part - here.idle)])
-
-    found = optimistix.least_squares(residual, solver, z / _RADIUS, (numbers_, weight), max_steps=steps, throw=False)
-    return _RADIUS * found.value
+    root = lax.custom_root(slope, found.regular, lambda _, share: share, back)
+    return found.share + root - lax.stop_gradient(root)
 
 
 def _still(task: _Task) -> _Task:
