@@ -153,8 +153,9 @@ def test_a_design_that_was_killed_goes_on_to_the_bit(scene, tips, tmp_path, monk
     resumed = vsr.design(scene, FREE, TipError(tips), SETS, out=out, **settings)
     np.testing.assert_array_equal(resumed.trace.objective, whole.trace.objective)
     assert resumed.objective == whole.objective
-    with pytest.raises(ValueError, match="holds something else"):
-        vsr.design(scene, FREE, TipError(tips), SETS, out=out, **settings | {"rate": 0.01})
+    for other in ({"rate": 0.01}, {"optimizer": optax.sgd(0.1)}):
+        with pytest.raises(ValueError, match="holds something else"):
+            vsr.design(scene, FREE, TipError(tips), SETS, out=out, **settings | other)
 
 
 def test_it_stops_when_it_is_good_enough(scene, tips):

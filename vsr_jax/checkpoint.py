@@ -10,26 +10,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .descent import Problem, State, Trace
+from .descent import Problem, State, Trace, first_update
 from .fingerprint import fingerprint
 
 
 class Checkpoint:
     """The file of one problem with its settings: a line of JSON, then the arrays.
 
-    **Arguments:** `path`: the file, None to keep nothing; `problem`, `settings`: what tells this descent from others.
+    **Arguments:** `path`: the file, None to keep nothing; `problem`, `optimizer`, `settings`: what tells this descent from others.
 
     **Raises:** `ValueError` for a path that cannot be written.
     """
 
-    def __init__(self, path: str | os.PathLike | None, problem: Problem, settings: tuple[Any, ...]):
+    def __init__(self, path: str | os.PathLike | None, problem: Problem, optimizer: Any, settings: tuple[Any, ...]):
         self._path = None if path is None else Path(path)
         if self._path is None:
             return
         if not self._path.parent.is_dir() or self._path.is_dir():
             raise ValueError(f"design.out: got {str(path)!r}, need a file in a folder that is there")
         middle = jax.tree.map(lambda low, high: 0.5 * (low + high), problem.low, problem.high)
-        self._digest = fingerprint(problem.terms, (middle,), problem.low, problem.high, settings)
+        rule = fingerprint(first_update, (optimizer, middle))
+        self._digest = fingerprint(problem.terms, (middle,), problem.low, problem.high, rule, settings)
 
     def begun(self, states: State) -> tuple[State, Trace]:
         """Where the descent stands: as kept in the file, or at its first states.

@@ -83,6 +83,15 @@ def adam(rate: float, steps: int) -> optax.GradientTransformationExtraArgs:
     return optax.with_extra_args_support(optax.adam(optax.cosine_decay_schedule(rate, steps), b2=0.99))
 
 
+def first_update(optimizer: optax.GradientTransformationExtraArgs, z: Numbers) -> Any:
+    """What an optimiser makes of a first slope, of the same numbers as the point: a program that tells it from others."""
+
+    def half(z: Numbers) -> Array:
+        return jnp.asarray(sum(jnp.sum(x**2) for x in jax.tree.leaves(z))) / 2
+
+    return optimizer.update(z, optimizer.init(z), z, value=half(z), grad=z, value_fn=half)[0]
+
+
 def weight(done: int, total: int) -> Array:
     """Weight of the penalties after so many steps of a total."""
     return jnp.asarray(_LEAST_WEIGHT * (_MOST_WEIGHT / _LEAST_WEIGHT) ** (done / max(total - 1, 1)))

@@ -107,7 +107,7 @@ def design(
     total = count("design.steps", steps)
     method = adam(positive("design.rate", rate), total) if optimizer is None else optax.with_extra_args_support(optimizer)
     many = count("design.starts", starts)
-    kept = Checkpoint(out, problem, (many, count("design.tried", tried), seed, total, rate))
+    kept = Checkpoint(out, problem, method, (many, count("design.tried", tried), seed, total))
     states = begin(problem, method, given, many, tried, seed)
     states, trace = _run(problem, method, kept, states, total, _Stop(enough, patience), progress)
     return _result(problem, terms, states, trace)
