@@ -106,12 +106,17 @@ class _Shapes(NamedTuple):
     slopes: np.ndarray
 
 
-def _compiled(function: Callable, *args: Any) -> Any:
-    options = _QUICK if jax.default_backend() == "cpu" and jax.__version_info__ < (0, 11) else None
-    return jax.jit(function).lower(*args).compile(compiler_options=options)(*args)
+class _Task(NamedTuple):
+    """What a few shapes are computed by: compiled beforehand, since that goes side by side, and running does not."""
+
+    program: Callable
+    inputs: Array
+
+    def shapes(self) -> _Shapes:
+        return _Shapes(*(np.asarray(x, float) for x in self.program(self.inputs)))
 
 
-def _shapes(scene: Scene, inputs: Array, model: Model) -> _Shapes:
+def _task(scene: Scene, inputs: Array, model: Model) -> _Task:
     numbers, rest = eqx.partition(scene, eqx.is_inexact_array)
     X = jnp.linspace(0, 1, STATIONS, dtype=inputs.dtype) * scene.rod.length
 
@@ -123,7 +128,8 @@ def _shapes(scene: Scene, inputs: Array, model: Model) -> _Shapes:
         slopes = jax.tree.leaves(jax.jacfwd(tip)((numbers, u)))
         return eq.tip[:3, 3], eq.strain(X), jnp.concatenate([leaf.reshape(3, -1) for leaf in slopes], axis=1)
 
-    return _Shapes(*(np.asarray(x, float) for x in _compiled(jax.vmap(of), inputs)))
+    options = _QUICK if jax.default_backend() == "cpu" and jax.__version_info__ < (0, 11) else None
+    return _Task(jax.jit(jax.vmap(of)).lower(inputs).compile(compiler_options=options), inputs)
 
 
 def _errors(scene: Scene, inputs: Array, found: _Shapes, true: _Shapes) -> tuple[float | None, float | None, float | None]:
@@ -163,9 +169,9 @@ def measure(
     - `say`: told the name of each setting when its turn to be compiled has come.
     """
     exact = reference or StrainDependent(96 if scene.coupled else 256)
-    true = _shapes(scene, inputs[:FEW], exact)
+    true = _task(scene, inputs[:FEW], exact).shapes()
 
-    def prepare(way: Setting) -> tuple[tuple[Timed, Timed], tuple[float | None, float | None, float | None]]:
+    def prepare(way: Setting) -> tuple[tuple[Timed, Timed], _Task]:
         say(f"{way.family}, {way.label}, {way.dtype}")
         dtype = jnp.dtype(way.dtype)
         arm, batch = cast(scene, dtype), inputs.astype(dtype)
@@ -174,13 +180,14 @@ def measure(
             return solve(arm, u, model=way.model).tip[:3, 3]
 
         jobs = Timed(tip, batch[0], calls=_SINGLES), Timed(jax.vmap(tip), batch)
-        return jobs, _errors(scene, inputs[:FEW], _shapes(arm, batch[:FEW], way.model), true)
+        return jobs, _task(arm, batch[:FEW], way.model)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # while one is traced another compiles
         prepared = list(pool.map(prepare, ways))
+    errors = [_errors(scene, inputs[:FEW], task.shapes(), true) for _, task in prepared]
     say("all of them are timed")
     take_turns([job for jobs, _ in prepared for job in jobs], rounds)
-    return [_row(way, *found) for way, found in zip(ways, prepared, strict=True)]
+    return [_row(way, jobs, found) for way, (jobs, _), found in zip(ways, prepared, errors, strict=True)]
 
 
 def _row(way: Setting, jobs: tuple[Timed, Timed], errors: tuple[float | None, float | None, float | None]) -> Row:

@@ -24,7 +24,7 @@ from .scene import Scene
 from .strain_dependent import StrainDependent
 
 _ROOMS = (64, 256, 1024)
-_LADDER = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 14, 16, 18, 20, 22, 24, 26, 28, 32, 36, 40, 44, 48)
+_LADDER = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 18, 20, 22, 24, 26, 28, 32, 36, 40, 44, 48)
 """Numbers of steps that are tried where there is room for 64; with more room they grow alike."""
 
 _SHARE = 0.5

@@ -3,7 +3,7 @@
 The package never imports this module by itself: `from vsr_jax import plot`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -52,10 +52,10 @@ class Samples(NamedTuple):
         return self.pose[:, :3, 3]
 
 
-def sample(eq: Equilibrium, stations: Any = 60) -> Samples:
+def sample(eq: Equilibrium, stations: Any = 60, *, program: Callable | None = None) -> Samples:
     """Everything the pictures need of an equilibrium, computed once; `arm` and `strains` take it in place of `eq`.
 
-    **Arguments:** `stations`: how many, evenly spaced on the arm, or their abscissas [m].
+    **Arguments:** `stations`: how many, evenly spaced on the arm, or their abscissas [m]; `program`: what `sampling` compiled.
 
     **Raises:** `ValueError` for a batch of equilibria and for one that did not converge.
     """
@@ -63,9 +63,19 @@ def sample(eq: Equilibrium, stations: Any = 60) -> Samples:
         raise ValueError(f"eq: got a batch of shape {np.shape(eq.status)}, need one equilibrium")
     if not bool(eq.converged):
         raise ValueError(f"eq: got a solve that failed ({eq.message}), need a converged one")
-    X = np.linspace(0.0, float(eq.scene.rod.length), stations) if isinstance(stations, int) else np.asarray(stations)
-    pose, strain, threads, wall = (np.asarray(part) for part in _along(eq, jnp.asarray(X, eq.inputs.dtype)))
+    X = _abscissas(eq, stations)
+    pose, strain, threads, wall = (np.asarray(part) for part in (program or _along)(eq, jnp.asarray(X, eq.inputs.dtype)))
     return Samples(X, pose, strain, _sweep(pose, threads).swapaxes(0, 1), _sweep(pose, wall))
+
+
+def sampling(eq: Equilibrium, stations: Any = 60) -> Callable:
+    """The program by which `sample` works, compiled: for this equilibrium and for all of the same model and kind of scene."""
+    X = jnp.asarray(_abscissas(eq, stations), eq.inputs.dtype)
+    return _along.lower(eq, X).compile()  # pyright: ignore[reportFunctionMemberAccess]
+
+
+def _abscissas(eq: Equilibrium, stations: Any) -> np.ndarray:
+    return np.linspace(0.0, float(eq.scene.rod.length), stations) if isinstance(stations, int) else np.asarray(stations)
 
 
 @eqx.filter_jit

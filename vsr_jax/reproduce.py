@@ -4,7 +4,7 @@ import json
 import os
 import platform
 import time
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +21,7 @@ from .continuum import Continuum
 from .discrete import Prescribed
 from .equilibrium import Equilibrium
 from .model import Model
-from .plot import Samples, sample
+from .plot import Samples, sample, sampling
 from .solve import solve
 from .strain_dependent import StrainDependent
 
@@ -87,9 +87,10 @@ def compare(cases: Sequence[str] = tuple(paper.CASES), *, progress: bool = True)
     work = [(case, *named, solution) for case in cases for named in models(case).items() for solution in paper.reference(case)]
     seen: set = set()
     solved = [_timed(case, model, solution, seen) for case, _, model, solution in tqdm(work, "solves", disable=not progress)]
-    with ThreadPoolExecutor(2) as pool:  # after the timing: compiling is most of it, and two programs compile side by side
-        groups = list(tqdm(pool.map(_curves, _by_program(solved)), "curves", sum(s.fresh for s in solved), disable=not progress))
-    samples = {index: curve for group in groups for index, curve in group.items()}
+    groups = _by_program(solved)
+    with ThreadPoolExecutor(2) as pool:  # compiling is most of it; programs that run side by side can wait for each other for ever
+        programs = list(tqdm(pool.map(_program, groups), "curves", len(groups), disable=not progress))
+    samples = {index: curve for pair in zip(groups, programs, strict=True) for index, curve in _curves(*pair).items()}
     return [Result(_row(*item, s, samples[i]), samples[i]) for i, (item, s) in enumerate(zip(work, solved, strict=True))]
 
 
@@ -133,8 +134,12 @@ def _by_program(solved: Sequence[_Solved]) -> list[dict[int, Equilibrium]]:
     return list(groups.values())
 
 
-def _curves(group: dict[int, Equilibrium]) -> dict[int, Samples | None]:
-    return {index: sample(eq, STATIONS) if bool(eq.converged) else None for index, eq in group.items()}
+def _program(group: dict[int, Equilibrium]) -> Callable:
+    return sampling(next(iter(group.values())), STATIONS)
+
+
+def _curves(group: dict[int, Equilibrium], program: Callable) -> dict[int, Samples | None]:
+    return {index: sample(eq, STATIONS, program=program) if bool(eq.converged) else None for index, eq in group.items()}
 
 
 def _row(case: str, name: str, model: Model, solution: paper.Solution, solved: _Solved, samples: Samples | None) -> Row:

@@ -4,6 +4,7 @@ import os
 import platform
 import time
 from collections.abc import Callable, Iterable
+from functools import cached_property
 from typing import Any
 
 import jax
@@ -21,7 +22,6 @@ class Timed:
     - `compile_s`: time to trace and compile it [s].
     - `operations`: floating-point operations of the compiled program, the body of each loop counted once; None if XLA does
       not say.
-    - `output`: what the first call returned.
     """
 
     def __init__(self, function: Callable, *args: Any, calls: int = 1):
@@ -31,7 +31,12 @@ class Timed:
         self.args, self.calls = args, calls
         self.samples: list[float] = []
         self.cpu_samples: list[float] = []
-        self.output = jax.block_until_ready(self.compiled(*args))
+
+    @cached_property
+    def output(self) -> Any:
+        """What the first call returned. That is made when first asked for, and not in the constructor: programs may be compiled side by
+        side, but two that run so from two threads can wait for each other for ever on a CPU."""
+        return jax.block_until_ready(self.compiled(*self.args))
 
     @property
     def operations(self) -> int | None:
@@ -40,7 +45,8 @@ class Timed:
         return int(costs["flops"]) if isinstance(costs, dict) and "flops" in costs else None
 
     def run(self) -> None:
-        """Calls it and notes the times [us], by the clock and on the CPUs."""
+        """Calls it and notes the times [us], by the clock and on the CPUs; the very first call is not among them."""
+        _ = self.output
         for _ in range(self.calls):
             start, cpu = time.perf_counter(), time.process_time()
             jax.block_until_ready(self.compiled(*self.args))
