@@ -21,10 +21,18 @@ def tip_distance(a, b):
     return float(jnp.linalg.norm((a.tip - b.tip)[:3, 3]))
 
 
-@pytest.mark.parametrize(("steps", "order"), [(8, 6), (16, 6), (16, 4), (64, 2)])
+@pytest.mark.parametrize(("steps", "order"), [(8, 6), (16, 6), (13, 6), (16, 4), (64, 2)])
 def test_tip_error_of_the_steps(steps, order):
     eq = vsr.solve(HELICES, PULL, model=vsr.StrainDependent(steps, order))
     honest(float(eq.error.tip), tip_distance(eq, vsr.solve(HELICES, PULL, model=vsr.StrainDependent(160))))
+
+
+def test_tip_error_of_one_step_and_of_an_arm_in_pieces():
+    tapering, stiff = vsr.Circular(vsr.Taper(0.012, 0.010)), vsr.Material(vsr.Piecewise((0.1,), (8e5, 4e5)), poisson=0.45)
+    for young, routing, steps in ((vsr.Material(8e5, poisson=0.45), vsr.Parallel(0.005, 0.0), 1), (stiff, vsr.Helix(0.007, 1.0), 6)):
+        scene = vsr.Scene(vsr.Rod(0.3, tapering, young), [vsr.Tendon(routing)])
+        eq = vsr.solve(scene, [1.0], model=vsr.StrainDependent(steps))
+        honest(float(eq.error.tip), tip_distance(eq, vsr.solve(scene, [1.0], model=vsr.StrainDependent(64))))
 
 
 def test_errors_against_the_independent_reference():

@@ -15,7 +15,7 @@ from .balance import forces_where, residual, rounding_floor, tangent, thread_dir
 from .basis import AbstractBasis
 from .component import Vector
 from .coupled import problem_of, with_tensions
-from .galerkin import solve_prescribed
+from .galerkin import solve_prescribed, whitening
 from .implicit import change_of, no_derivative
 from .kinematics import ORDERS, accumulate_jacobian
 from .model import Nodes, Outcome, Status, SteppedModel, classify
@@ -71,11 +71,11 @@ def solve_projected(projection: Projection, tau: Vector) -> tuple[Float[Array, "
     Derivatives of any order are implicit.
     """
     K = projection.elastic_stiffness()
-    K_factor = jnp.linalg.cholesky(K)
+    scaling = whitening(K)
     axial = jnp.sum(projection.weight * projection.sections.stiffness[3])
 
     def norm(force: Array) -> Array:
-        return jnp.linalg.norm(jax.scipy.linalg.solve_triangular(K_factor, force, lower=True)) / jnp.sqrt(axial)
+        return jnp.linalg.norm(scaling @ force) / jnp.sqrt(axial)
 
     def imbalance(q: Array) -> Array:
         return projection.integrate(residual(projection.strain(q), projection.sections, tau))
@@ -84,7 +84,7 @@ def solve_projected(projection: Projection, tau: Vector) -> tuple[Float[Array, "
         r = imbalance(q)
         step = _solve(projection.stiffness(tangent(projection.strain(q), projection.sections, tau)), r)
         definite = ~jnp.any(jnp.isnan(step))
-        step = jnp.where(definite, step, jax.scipy.linalg.cho_solve((K_factor, True), r))
+        step = jnp.where(definite, step, scaling.T @ (scaling @ r))
         return Evaluation(step, norm(K @ step), norm(r), definite)
 
     floor = jnp.max(rounding_floor(projection.sections.stiffness, tau)) * K.shape[0] ** 0.5

@@ -71,18 +71,26 @@ def imbalance(unknown: Unknown, basis: Basis, problem: Problem, kind: Kind) -> U
     return Unknown(force, jnp.stack(rows) if rows else unknown.tension)
 
 
+def whitening(K: Float[Array, "dofs dofs"]) -> Float[Array, "dofs dofs"]:
+    """$L^{-1}$ of $K = L L^T$, with which norms and products by $K^{-1}$ are plain products.
+
+    Two of LAPACK's routines must not run side by side in a program: each waits on a thread of XLA's pool for parts of its batch to be
+    done by the others, and on two cores they wait for ever (jaxlib 0.10.2, from batches of some 128 matrices of 24 rows on).
+    """
+    return jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(K), jnp.eye(K.shape[0], dtype=K.dtype), lower=True)
+
+
 @partial(jax.custom_jvp, nondiff_argnums=(2,))
 def solve_prescribed(basis: Basis, problem: Problem, kind: Kind) -> Solution:
     """Equilibrium in the basis, by damped Newton steps from rest. Derivatives are implicit, of any order."""
     sections, weight = problem.sections, problem.grid.weight
     K = jnp.einsum("ij,ijca,cij,ijcb->ab", weight, basis.matrix, jnp.stack(jnp.broadcast_arrays(*sections.stiffness)), basis.matrix)
-    factor = jnp.linalg.cholesky(K)
+    scaling = whitening(K)
     size, length = K.shape[0], jnp.sum(problem.grid.h)
     axial = jnp.sum(weight * sections.stiffness[3]) / length
 
     def norm(unknown: Unknown) -> Array:
-        force = jax.scipy.linalg.solve_triangular(factor, unknown.q, lower=True)
-        return jnp.sqrt(jnp.sum(force**2) / (axial * length) + jnp.sum((unknown.tension / axial) ** 2))
+        return jnp.sqrt(jnp.sum((scaling @ unknown.q) ** 2) / (axial * length) + jnp.sum((unknown.tension / axial) ** 2))
 
     def evaluate(unknown: Unknown, damping: Array, share: Array) -> Damped:
         part = problem.with_share(share)
@@ -91,7 +99,8 @@ def solve_prescribed(basis: Basis, problem: Problem, kind: Kind) -> Solution:
         J = J.at[:size, :size].add(damping * K)
         flat = jnp.linalg.solve(J, jnp.concatenate(r))
         step = Unknown(flat[:size], flat[size:])
-        definite = ~jnp.any(jnp.isnan(jnp.linalg.cholesky(J[:size, :size])))
+        solved = jnp.where(jnp.any(jnp.isnan(flat)), jnp.nan, J[:size, :size])  # after the solve, never beside it: see `whitening`
+        definite = ~jnp.any(jnp.isnan(jnp.linalg.cholesky(solved)))
         return Damped(step, norm(Unknown(K @ step.q, step.tension)), r.q, norm(r), definite)
 
     def work(force: Array, step: Unknown) -> Array:

@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from ._check import concrete, numbers
@@ -126,14 +127,15 @@ class SplineProfile(Profile):
         if n == 3:
             second = (secant[1] - secant[0]) / (x[2] - x[0])
             return jnp.stack([secant[0] - second * h[0], secant[0] + second * h[0], secant[1] + second * h[1]])
-        matrix = jnp.zeros((n, n), x.dtype)
-        i = np.arange(1, n - 1)
-        matrix = matrix.at[i, i - 1].set(h[1:]).at[i, i].set(2 * (h[:-1] + h[1:])).at[i, i + 1].set(h[:-1])
-        right = jnp.zeros_like(x).at[i].set(3 * (h[1:] * secant[:-1] + h[:-1] * secant[1:]))
-        for row, sign, (p, q), (s, t) in ((0, 1, h[:2], secant[:2]), (n - 1, -1, h[-2:][::-1], secant[-2:][::-1])):
-            matrix = matrix.at[row, row].set(q).at[row, row + sign].set(p + q)
-            right = right.at[row].set(((p + 2 * (p + q)) * q * s + p**2 * t) / (p + q))
-        return jnp.linalg.solve(matrix, right)
+        inner = 3 * (h[1:] * secant[:-1] + h[:-1] * secant[1:])
+        ends = []
+        for (p, q), (s, t) in ((h[:2], secant[:2]), (h[-2:][::-1], secant[-2:][::-1])):
+            ends.append((q, p + q, ((p + 2 * (p + q)) * q * s + p**2 * t) / (p + q)))
+        (first, above, start), (last, below, end) = ends
+        lower = jnp.concatenate([jnp.zeros(1, x.dtype), h[1:], below[None]])
+        diagonal = jnp.concatenate([first[None], 2 * (h[:-1] + h[1:]), last[None]])
+        upper = jnp.concatenate([above[None], h[:-1], jnp.zeros(1, x.dtype)])
+        return _tridiagonal(lower, diagonal, upper, jnp.concatenate([start[None], inner, end[None]]))
 
     def __call__(self, X: Scalar, length: Scalar) -> Scalar:
         slopes = self._slopes()
@@ -143,6 +145,24 @@ class SplineProfile(Profile):
         secant = (self.values[i + 1] - self.values[i]) / h
         d0, d1 = slopes[i], slopes[i + 1]
         return self.values[i] + h * s * (d0 + s * ((3 * secant - 2 * d0 - d1) + s * (d0 + d1 - 2 * secant)))
+
+
+def _tridiagonal(lower: Array, diagonal: Array, upper: Array, right: Array) -> Array:
+    """Solution by elimination without pivots, whose order the rows of a spline do not need."""
+
+    def down(above: tuple[Array, Array], row: tuple[Array, Array, Array, Array]) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        (ratio, value), (left, middle, beyond, side) = above, row
+        pivot = middle - left * ratio
+        here = beyond / pivot, (side - left * value) / pivot
+        return here, here
+
+    def up(after: Array, row: tuple[Array, Array]) -> tuple[Array, Array]:
+        here = row[1] - row[0] * after
+        return here, here
+
+    zero = jnp.zeros((), right.dtype)
+    _, rows = lax.scan(down, (zero, zero), (lower, diagonal, upper, right))
+    return lax.scan(up, zero, rows, reverse=True)[1]
 
 
 class Piecewise(Profile):

@@ -75,6 +75,14 @@ def interpolation(stages: int) -> np.ndarray:
     return np.linalg.inv(np.vander(gauss_legendre(stages)[0], increasing=True))
 
 
+def merging(stages: int) -> np.ndarray:
+    """Weights that carry values at the Gauss nodes of two equal steps, of the first and then of the second, to those of one step of both
+    by the polynomial through all of them; shape (stages, 2 stages)."""
+    nodes = gauss_legendre(stages)[0]
+    through = np.linalg.inv(np.vander(np.concatenate([nodes, nodes + 1]) / 2, increasing=True))
+    return np.vander(nodes, 2 * stages, increasing=True) @ through
+
+
 def weighted(weights: np.ndarray, values: Array) -> Array:
     """Sum of the values at the nodes of a step, each with its weight."""
     total = float(weights[0]) * values[0]
