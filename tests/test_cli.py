@@ -201,7 +201,9 @@ def test_bounds_of_a_sweep_are_one_or_one_an_actuator(capsys):
 
 def test_a_tolerance_chooses_the_steps_and_tells_the_error(capsys):
     assert cli.main(["solve", HELIX, "--tolerance", "1e-4"]) == cli_common.DONE
-    error = re.search(r"  error      (\S+) m of the tip by estimate, with StrainDependent\(steps=(\d+), order=6\)", capsys.readouterr().out)
+    error = re.search(
+        r"  error      (\S+) m of the tip against a finer solve, with StrainDependent\(steps=(\d+), order=6\)", capsys.readouterr().out
+    )
     assert error
     assert 1e-6 < float(error[1]) < 1e-4
     assert int(error[2]) < 32

@@ -230,6 +230,7 @@ def test_throw_raises_with_the_status_in_words(name, words):
         vsr.solve(*TABLE[name][:2], model=MODEL, throw=True)
 
 
+@pytest.mark.slow
 def test_two_hundred_drawn_arms_are_right_or_say_why():
     from benchmarks.hard_search import search
 

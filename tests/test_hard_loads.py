@@ -137,6 +137,7 @@ def finer(scene, tension, _):
     return vsr.solve(scene, -tension[None], model=MODEL.finer()).tip[:3, 3] / scene.rod.length
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CONVERGED)
 def test_gradients_are_those_of_differences(name):
     case, (found, _) = TABLE[name], at(gradient, TABLE[name], "float64")
@@ -168,6 +169,7 @@ def shape_of(scene, inputs):
     return eq.tip[:3, 3] / scene.rod.length, eq.stability, eq.status
 
 
+@pytest.mark.slow
 @PRECISIONS
 @pytest.mark.parametrize("young", [1e3, 1e6, 2e11])
 @pytest.mark.parametrize("length", [1e-3, 0.3, 10.0])

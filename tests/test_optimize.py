@@ -173,6 +173,7 @@ def test_it_stops_when_it_gains_no_more():
     assert not _Stop(1.0, None).says(violated)
 
 
+@pytest.mark.slow
 def test_another_optimiser_and_single_precision(scene, tips):
     settings = {"model": MODEL, "starts": 1, "steps": 30, "tried": 1, "progress": False}
     found = vsr.design(scene, FREE, TipError(tips.astype(jnp.float32)), np.float32(SETS), optimizer=optax.sgd(0.5), **settings)
@@ -180,6 +181,7 @@ def test_another_optimiser_and_single_precision(scene, tips):
     assert found.objective < found.trace.objective[0, 0]
 
 
+@pytest.mark.slow
 def test_starts_that_cannot_be_solved_are_left_behind(scene):
     """Half of the range of tensions collapses the arm."""
     low = Measure(lambda arms: jnp.mean(arms.each(lambda eq: eq.tip[0, 3])) / LENGTH)

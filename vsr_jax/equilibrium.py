@@ -96,7 +96,8 @@ class Equilibrium(eqx.Module):
 
     @property
     def error(self) -> Error:
-        """Estimates of the errors of tip [m] and strain, from a finer solution that starts from this one; NaN where it failed."""
+        """Estimates of the errors of tip [m] and strain, from a coarser solution or a finer one that start from this one; NaN where
+        it failed."""
         self._refuse_batch()
         return self._error()
 

@@ -9,12 +9,13 @@ from .equilibrium import Equilibrium
 from .health import MOST_FACTOR, Health, Limit
 from .model import Status
 from .plot import Samples
+from .solve import solve
 
 
 def lines(eq: Equilibrium, title: str = "", *, error: bool = False) -> list[str]:
     """An equilibrium in a few lines: status, tip, margin of stability, and of each thread its input, force and length.
 
-    **Arguments:** `eq`: one equilibrium, solved or not; `title`: a first line; `error`: whether to estimate the tip's error too.
+    **Arguments:** `eq`: one equilibrium, solved or not; `title`: a first line; `error`: whether to tell the tip's error too, by a finer solve.
     """
     method = f"{type(eq.model).__name__}, {eq.inputs.dtype}, {int(eq.steps)} steps"
     text = [title] if title else []
@@ -25,7 +26,9 @@ def lines(eq: Equilibrium, title: str = "", *, error: bool = False) -> list[str]
     tip = np.asarray(eq.tip)
     text.append(f"  tip        {_vector(tip[:3, 3])} m")
     if error:
-        text.append(f"  error      {float(eq.error.tip):.2g} m of the tip by estimate, with {eq.model}")
+        finer = solve(eq.scene, eq.inputs, model=eq.model.finer())
+        far = float(np.linalg.norm(np.asarray(finer.tip)[:3, 3] - tip[:3, 3]))
+        text.append(f"  error      {far:.2g} m of the tip against a finer solve, with {eq.model}")
     text += [f"  its {name} axis {_vector(axis)}" for name, axis in zip("xyz", tip[:3, :3].T, strict=True)]
     text.append(f"  stability  {float(eq.stability):.4g} (1 without forces, 0 where the equilibrium ceases to be stable)")
     return text + _threads(eq)
