@@ -15,7 +15,7 @@ from .solve import solve
 def lines(eq: Equilibrium, title: str = "", *, error: bool = False) -> list[str]:
     """An equilibrium in a few lines: status, tip, margin of stability, and of each thread its input, force and length.
 
-    **Arguments:** `eq`: one equilibrium, solved or not; `title`: a first line; `error`: whether to tell the tip's error too, by a finer solve.
+    **Arguments:** `eq`: one equilibrium, solved or not; `title`: a first line; `error`: whether to solve finer too and tell the difference.
     """
     method = f"{type(eq.model).__name__}, {eq.inputs.dtype}, {int(eq.steps)} steps"
     text = [title] if title else []
