@@ -5,6 +5,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from . import component as c
@@ -14,10 +15,13 @@ from .coupled import Imbalance, Kind, Problem, State, Unknown, state_of
 from .elimination import eliminate
 
 _REFINEMENTS = 60
-"""Bound on how often a tangent system is refined; it takes five to ten."""
+"""Bound on the steps that refine the solution of a tangent system; five to ten are usual."""
 
-_KEPT = 3
-"""How many directions are kept for the next to be conjugate to."""
+_KEPT = 8
+"""Number of earlier directions to which each new residual is made orthogonal."""
+
+_FINAL, _ACCEPTED = 8.0, 1e4
+"""Residual at which refining ends and residual up to which the solution is accepted, in machine epsilons."""
 
 
 def approximate_solve(
@@ -70,77 +74,88 @@ def _tensions(unknown: Unknown, at: State, right: Imbalance, problem: Problem, k
 
 
 def tangent_solve(imbalance: Callable, unknown: Unknown, problem: Problem, right: Imbalance, kind: Kind) -> Imbalance:
-    """Solution of the exact tangent system, with `approximate_solve` as preconditioner; NaN where it is not found."""
-    # custom_linear_solve has a transpose only if all of its right side is linear in the tangents; rows that nothing moves are not
-    tie = 0.0 * sum((jnp.sum(x) for x in jax.tree.leaves(right)), jnp.zeros_like(right.wrench[0][0, 0]))
-    right = jax.tree.map(lambda x: x + tie, right)
+    r"""Solution of the exact tangent system $A x = b$, with `approximate_solve` as preconditioner; NaN where it is not found.
+
+    Everything is scaled by energies: a change of strain $\delta\xi$ becomes $\sqrt{\Sigma w}\,\delta\xi$, a wrench $\sqrt{w / \Sigma}\,r$,
+    with the weight w of its node, and tensions and turning rates likewise. The scaled A is the identity plus what loads and threads
+    add, symmetric where these have a potential, and its transpose is of the same kind. So one norm serves both modes of
+    differentiation.
+    """
     still = jax.tree.map(jnp.zeros_like, right)
     _, matvec = jax.linearize(imbalance, still)
     at = state_of(unknown, problem, kind)
+    to_row, to_change = lax.stop_gradient(_units(problem, kind, still))
+    _, unravel = ravel_pytree(still)
 
     def nearly(b: Imbalance) -> Imbalance:
         step, _ = approximate_solve(unknown, at, b, problem, kind)
         step = jax.tree.map(lambda x: x.astype(problem.grid.h.dtype), step)
         return Imbalance(chosen(step.xi, kind.free), step.tension, step.turning)
 
+    def scaled_apply(x: Array) -> Array:
+        return to_row * ravel_pytree(matvec(unravel(to_change * x)))[0]
+
+    def scaled_nearly(b: Array) -> Array:
+        return ravel_pytree(nearly(unravel(b / to_row)))[0] / to_change
+
     # what does not depend on the right side is done once, before the loop
-    _, nearly = jax.linearize(nearly, still)
-    back = jax.linear_transpose(nearly, still)
-    weight = _weights(problem, kind)
+    b = to_row * ravel_pytree(right)[0]
+    _, forward = jax.linearize(scaled_nearly, jnp.zeros_like(b))
+    back = jax.linear_transpose(forward, b)
 
-    def solve(apply: Callable, b: Imbalance) -> Imbalance:
-        return _refined(apply, nearly, b, weight)
+    def solve(apply: Callable, b: Array) -> Array:
+        return _refined(apply, forward, b)
 
-    def transpose_solve(apply: Callable, b: Imbalance) -> Imbalance:
-        return _refined(apply, lambda r: back(r)[0], b, weight)
+    def transpose_solve(apply: Callable, b: Array) -> Array:
+        return _refined(apply, lambda r: back(r)[0], b)
 
-    return lax.custom_linear_solve(matvec, right, solve, transpose_solve)
-
-
-def _weights(problem: Problem, kind: Kind) -> Imbalance:
-    """Weights that make the squares of wrenches, forces and turning rates comparable: as strains without unit."""
-    stiffness = problem.sections.stiffness
-    axial = jnp.mean(stiffness[3])
-    wrench = tuple(1 / (axial * s) for s in chosen(stiffness, kind.free))
-    return Imbalance(wrench, (axial**-2,) * len(kind.cables), (jnp.mean(stiffness[1]) / axial,) * len(kind.rubbing))
+    return unravel(to_change * lax.custom_linear_solve(scaled_apply, b, solve, transpose_solve))
 
 
-def _refined(apply: Callable, nearly: Callable, right: Imbalance, weight: Imbalance) -> Imbalance:
-    """Solution by generalised conjugate residuals with a solver that is nearly right, each new residual normal to the last few.
+def _units(problem: Problem, kind: Kind, like: Imbalance) -> tuple[Array, Array]:
+    """What makes rows of the residual, and changes of the unknowns from their scaled ones, those of the scaled system."""
+    stiffness, weight = problem.sections.stiffness, problem.grid.weight
+    weight = jnp.maximum(weight, 1e-6 * jnp.max(weight))  # that of an empty step is 0
+    root = tuple(jnp.sqrt(weight * s) for s in chosen(stiffness, kind.free))
+    turn = jnp.sqrt(weight * jnp.minimum(stiffness[1], stiffness[2]))
+    tension = tuple(jnp.sqrt(cable.scale) for cable in problem.cables)
+    rows = Imbalance(tuple(weight / x for x in root), tuple(1 / x for x in tension), (turn,) * len(kind.rubbing))
+    changes = Imbalance(tuple(1 / x for x in root), tension, (1 / turn,) * len(kind.rubbing))
+    row, change = (ravel_pytree(jax.tree.map(lambda x, y: jnp.broadcast_to(x, y.shape), tree, like))[0] for tree in (rows, changes))
+    return row, change
+
+
+def _refined(apply: Callable, nearly: Callable, right: Array) -> Array:
+    """Solution of a scaled system by generalised conjugate residuals with a preconditioner, each step orthogonal to the last few.
 
     Where an arm is soft the approximate tangent may be ten times too stiff for one of its motions. Refining by the residual
-    alone would then take hundreds of steps; the few directions kept find such a motion at once.
+    alone would then take hundreds of steps; the few directions kept find such a motion at once. What counts as solved is decided
+    by the residual of the result itself.
     """
-    least = 4 * jnp.finfo(right.wrench[0].dtype).eps
-    still, zero = jax.tree.map(jnp.zeros_like, right), jnp.zeros_like(_largest(right))
+    eps, size = jnp.finfo(right.dtype).eps, jnp.linalg.norm(right)
 
-    def dot(a: Imbalance, b: Imbalance) -> Array:
-        return sum(jax.tree.leaves(jax.tree.map(lambda w, x, y: jnp.sum(w * x * y), weight, a, b)), zero)
+    def whole(x: Array) -> Array:
+        return jnp.maximum(size, jnp.linalg.norm(x))
 
     def proceed(carry: tuple) -> Array:
-        *_, correction, whole, count = carry
-        return (count < _REFINEMENTS) & (correction > least * whole)
+        x, r, *_, count = carry
+        return (count < _REFINEMENTS) & (jnp.linalg.norm(r) > _FINAL * eps * whole(x))
 
     def advance(carry: tuple) -> tuple:
-        x, r, kept, _, _, count = carry
+        x, r, P, Q, count = carry
         p = nearly(r)
         q = apply(p)
-        for old_p, old_q in kept:
-            share = dot(q, old_q)
-            p, q = c.subtract(p, c.scale(share, old_p)), c.subtract(q, c.scale(share, old_q))
-        size = dot(q, q)
-        inverse = jnp.where(size > 0, 1 / jnp.sqrt(jnp.where(size > 0, size, 1.0)), 0.0)
-        p, q = c.scale(inverse, p), c.scale(inverse, q)
-        part = dot(r, q)
-        step = c.scale(part, p)
-        x, r = c.add(x, step), c.subtract(r, c.scale(part, q))
-        return x, r, (*kept[1:], (p, q)), _largest(step), _largest(x), count + 1
+        for _ in range(2):  # once leaves rounding behind where little is left
+            share = Q @ q
+            p, q = p - share @ P, q - share @ Q
+        square = q @ q
+        inverse = jnp.where(square > 0, 1 / jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+        p, q = inverse * p, inverse * q
+        part = q @ r
+        place = count % _KEPT
+        return x + part * p, r - part * q, P.at[place].set(p), Q.at[place].set(q), count + 1
 
-    start = still, right, ((still, still),) * _KEPT, zero + jnp.inf, zero, 0
-    x, *_, correction, whole, _ = lax.while_loop(proceed, advance, start)
-    found = correction <= least**0.5 * whole  # no derivative rather than a wrong one
-    return jax.tree.map(lambda leaf: jnp.where(found, leaf, jnp.nan), x)
-
-
-def _largest(tree: Imbalance) -> Array:
-    return jnp.max(jnp.stack([jnp.max(jnp.abs(leaf)) for leaf in jax.tree.leaves(tree)]))
+    kept = jnp.zeros((_KEPT, *right.shape), right.dtype)
+    x, *_, count = lax.while_loop(proceed, advance, (jnp.zeros_like(right), right, kept, kept, 0))
+    found = jnp.linalg.norm(right - apply(x)) <= _ACCEPTED * eps * whole(x)  # no derivative rather than a wrong one
+    return jnp.where(found, x, jnp.nan)
