@@ -19,7 +19,7 @@ from jaxtyping import Array
 
 from . import component as c
 from .actuator import Tendon
-from .balance import chosen, residual, strain_norm
+from .balance import chosen, residual, thread_direction, thread_wrench
 from .cable import Cable, cable_of, path_length
 from .component import Vector
 from .friction import Rubbing, decay_at, reaction_rate, rubbed, strain_rate, turning_rate
@@ -175,14 +175,44 @@ def _turning_rates(unknown: Unknown, at: State, problem: Problem, rubbing: Rubbi
     return tuple(turning_rate(xi, xi_rate, sections, rubbing.sections_rate, place) for place in kind.rubbing)
 
 
-def size_of_loads(problem: Problem) -> Array:
-    """Largest of the wrenches that the loads bring, as a strain without unit."""
-    length, total = jnp.sum(problem.grid.h, axis=0), jnp.zeros_like(problem.grid.h[0])
-    if problem.loads is None:
-        return total
-    densities = [c.scale(length, density) for density in problem.loads[1:3] if density is not None]
-    wrenches = [part for part in (problem.loads.dead,) if part is not None]
-    for part in (*densities, *wrenches, *(point.wrench for point in problem.loads.follower_points)):
-        moment = c.add(part[:3], tuple(length * jnp.abs(x) for x in part[3:]))
-        total = total + jnp.max(strain_norm((*moment, *part[3:]), problem.sections.stiffness), axis=(0, 1))
-    return total
+def shape_size(strain: Vector, length: Array) -> Array:
+    r"""Size of a change of strain by the shape it makes, $\sqrt{L^2 |\kappa|^2 + |\upsilon|^2}$: turn over the arm's length, and strain.
+
+    In energies the bending of a slender arm would count for nothing: at L/r = 1000 a strain of 1e-6 in its fibres turns its tip by
+    a thousandth.
+    """
+    return jnp.sqrt(length**2 * c.dot(strain[:3], strain[:3]) + c.dot(strain[3:], strain[3:]))
+
+
+def shape_of(wrench: Vector, stiffness: Vector, length: Array) -> Array:
+    """`shape_size` of the strain that a wrench makes at rest."""
+    return shape_size(tuple(f / s for f, s in zip(wrench, stiffness, strict=True)), length)
+
+
+def pull_of(sections: CrossSections, place: int, length: Array) -> Array:
+    """`shape_size` of the strain that a unit of a thread's force makes at rest [1/N]."""
+    path = sections.paths[place]
+    return shape_of(thread_wrench(thread_direction(sections.rest, path)[0], path), sections.stiffness, length)
+
+
+def rounding_of(problem: Problem) -> Array:
+    """What is left of the `shape_size` of a balanced residual in floating point, of the shape of the arms side by side.
+
+    A multiple of the machine's epsilon by the sizes of what is in balance: threads, loads and curvature at rest.
+    """
+    sections, loads, length = problem.sections, problem.loads, jnp.sum(problem.grid.h, axis=0)
+
+    def largest(x: Array) -> Array:
+        return jnp.max(x, axis=(0, 1))
+
+    straight = tuple(jnp.zeros_like(x) for x in sections.rest[3:])
+    total = 1.0 + largest(shape_size((*sections.rest[:3], *straight), length))
+    for place, force in enumerate(problem.forces):
+        total = total + jnp.abs(force) * largest(pull_of(sections, place, length))
+    if loads is not None:
+        densities = [c.scale(length, density) for density in (loads.dead_density, loads.follower_density) if density is not None]
+        wrenches = [part for part in (loads.dead,) if part is not None]
+        for part in (*densities, *wrenches, *(point.wrench for point in loads.follower_points)):
+            levers = sum(jnp.abs(x) for x in part[3:]) * length
+            total = total + largest(shape_of((*(jnp.abs(x) + levers for x in part[:3]), *part[3:]), sections.stiffness, length))
+    return 64 * jnp.finfo(total.dtype).eps * total

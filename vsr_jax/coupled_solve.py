@@ -10,13 +10,14 @@ from jax.custom_batching import custom_vmap
 from jaxtyping import Array
 
 from . import component as c
-from .balance import chosen, rounding_floor, solve_balance, spread, strain_norm, with_locked
+from .balance import chosen, solve_balance, spread, with_locked
 from .component import Vector
-from .coupled import Imbalance, Kind, Problem, State, Unknown, harmless, imbalance_of, size_of_loads, state_of, with_tensions
+from .coupled import Imbalance, Kind, Problem, State, Unknown, harmless, imbalance_of, pull_of, rounding_of, shape_of, shape_size, state_of, with_tensions
 from .coupled_tangent import approximate_solve, tangent_solve
 from .implicit import change_of, no_derivative
 from .newton import LOAD_SHARES, Damped, Solution, damped_newton
 from .quadrature import Grid
+from .scene import CrossSections
 
 _MOST_TURN = 1.5
 """Bound on how far [rad] one Newton step may turn the arm's end."""
@@ -102,10 +103,10 @@ def _side_by_side(kind: Kind) -> Callable[[Unknown, Problem], Solution]:
 
 
 class _Sizes(NamedTuple):
-    """Sizes of steps and imbalances without unit, one for each of the arms side by side: strains by the axial stiffness."""
+    """Sizes of steps and imbalances without unit, one for each of the arms side by side (see `shape_size`)."""
 
     grid: Grid
-    stiffness: Vector
+    sections: CrossSections
     kind: Kind
     arms: tuple[int, ...]
 
@@ -113,21 +114,19 @@ class _Sizes(NamedTuple):
     def length(self) -> Array:
         return jnp.sum(self.grid.h, axis=0)
 
-    @property
-    def axial(self) -> Array:
-        return jnp.sum(self.grid.weight * self.stiffness[3], axis=(0, 1)) / self.length
-
     def of_step(self, step: Unknown, at: State) -> Array:
-        """Largest change of a strain, a tension or a turning rate."""
-        moved = tuple(jnp.sqrt(s / self.stiffness[3]).astype(x.dtype) * x for s, x in zip(self.stiffness, step.xi, strict=True))
-        moved = jnp.sqrt(self._largest(c.dot(moved, moved)))
-        return sum((self._largest(x) for x in self._others(step.tension, step.turning, at)), moved)
+        """Largest change of the shape, of what a tension does to it, or of what friction takes of one."""
+        tensions = [tension * pull_of(self.sections, place, self.length) for place, tension in zip(self.kind.cables, step.tension, strict=True)]
+        moved = self._largest(shape_size(step.xi, self.length))
+        return sum((self._largest(x) for x in (*tensions, *self._rubbed(step.turning, at))), moved)
 
     def of_imbalance(self, imbalance: Imbalance, at: State) -> Array:
-        """Root of the mean square of all rows."""
-        strains = strain_norm(spread(imbalance.wrench, self.kind.free), self.stiffness)
-        square = jnp.sum(self.grid.weight * strains**2, axis=(0, 1)) / self.length
-        others = self._others(imbalance.cable, imbalance.turning, at)
+        """Root of the mean square of all rows; a cable's is its slack by the arm's length."""
+        wrench = spread(imbalance.wrench, self.kind.free)
+        bent = shape_of(wrench, self.sections.stiffness, self.length)
+        square = jnp.sum(self.grid.weight * bent**2, axis=(0, 1)) / self.length
+        axial = jnp.max(self.sections.stiffness[3], axis=(0, 1))
+        others = (*(force / axial for force in imbalance.cable), *self._rubbed(imbalance.turning, at))
         return jnp.sqrt(sum((jnp.mean(x**2, axis=self._inner(x)) for x in others), square))
 
     def turn(self, step: Unknown) -> Array:
@@ -139,10 +138,10 @@ class _Sizes(NamedTuple):
         """Work of the imbalance over a step; only its sign and its rough size matter."""
         return jnp.sum(c.single(self.grid.weight) * c.dot(wrench, chosen(step.xi, self.kind.free)), axis=(0, 1))
 
-    def _others(self, forces: Vector, rates: Vector, at: State) -> list[Array]:
-        """A force by the axial stiffness, a turning rate by what friction makes of it."""
-        turned = [self.length * at.tau[place] * rate / self.axial for place, rate in zip(self.kind.rubbing, rates, strict=True)]
-        return [*(force / self.axial for force in forces), *turned]
+    def _rubbed(self, rates: Vector, at: State) -> list[Array]:
+        """Changes of turning rates by what they make of the tensions."""
+        pulls = [pull_of(self.sections, place, self.length) for place in self.kind.rubbing]
+        return [self.length * at.tau[p] * rate * pull for p, rate, pull in zip(self.kind.rubbing, rates, pulls, strict=True)]
 
     def _inner(self, x: Array) -> tuple[int, ...]:
         return tuple(range(x.ndim - len(self.arms)))
@@ -152,7 +151,7 @@ class _Sizes(NamedTuple):
 
 
 def _solve(start: Unknown, whole: Problem, kind: Kind) -> Solution:
-    sizes = _Sizes(whole.grid, whole.sections.stiffness, kind, start.xi[0].shape[2:])
+    sizes = _Sizes(whole.grid, whole.sections, kind, start.xi[0].shape[2:])
 
     def evaluate(unknown: Unknown, damping: Array, share: Array) -> Damped:
         problem = whole.with_share(share)
@@ -165,6 +164,6 @@ def _solve(start: Unknown, whole: Problem, kind: Kind) -> Solution:
         step = jax.tree.map(lambda x: cut.astype(x.dtype) * x, step)
         return Damped(step, size, c.single(imbalance.wrench), sizes.of_imbalance(imbalance, at), definite)
 
-    floor = jnp.max(rounding_floor(sizes.stiffness, whole.forces), axis=(0, 1)) * (1 + size_of_loads(whole))
+    floor = rounding_of(whole)
     shares = 1 if whole.loads is None else LOAD_SHARES
     return damped_newton(evaluate, sizes.work, start, jnp.broadcast_to(floor, sizes.arms), shares)

@@ -8,7 +8,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from . import component as c
+from . import component as c, lu
 from .balance import chosen, spread, tangent, thread_direction, thread_wrench
 from .component import Vector
 from .coupled import Imbalance, Kind, Problem, State, Unknown, state_of
@@ -69,8 +69,10 @@ def _tensions(unknown: Unknown, at: State, right: Imbalance, problem: Problem, k
             row = row + unit * cable.stretch(at.carried[place], problem.grid)
         rows.append(jnp.where(slack_now, unit, cable.scale * row))
         sides.append(jnp.where(slack_now, right.cable[i], right.cable[i] + cable.scale * given[i]))
-    matrix, side = jnp.moveaxis(jnp.stack(rows), (0, 1), (-2, -1)), jnp.moveaxis(jnp.stack(sides), 0, -1)
-    return jnp.moveaxis(jnp.linalg.solve(matrix, side[..., None])[..., 0], -1, 0)
+    solve = lu.solve
+    for _ in range(given.ndim - 1):  # arms side by side, in the last axes
+        solve = jax.vmap(solve, in_axes=-1, out_axes=-1)
+    return solve(jnp.stack(rows), jnp.stack(sides))
 
 
 def tangent_solve(imbalance: Callable, unknown: Unknown, problem: Problem, right: Imbalance, kind: Kind) -> Imbalance:

@@ -8,14 +8,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from . import component as c, galerkin
+from . import component as c, galerkin, lu
 from ._check import choice, count, instance
 from ._types import Scalar
 from .balance import forces_where, residual, rounding_floor, tangent, thread_direction, thread_wrench
 from .basis import AbstractBasis
 from .component import Vector
 from .coupled import problem_of, with_tensions
-from .galerkin import solve_prescribed, whitening
+from .galerkin import solve_prescribed
 from .implicit import change_of, no_derivative
 from .kinematics import ORDERS, accumulate_jacobian
 from .model import Nodes, Outcome, Status, SteppedModel, classify
@@ -59,10 +59,6 @@ def project(scene: Scene, basis: AbstractBasis, points: int) -> Projection:
     return Projection(scene.sections(X), grid.weight.reshape(-1), matrix)
 
 
-def _solve(matrix: Array, right: Array) -> Array:
-    return jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(matrix), True), right)
-
-
 @jax.custom_jvp
 def solve_projected(projection: Projection, tau: Vector) -> tuple[Float[Array, " dofs"], Array, Array, Array]:
     r"""Coordinates q with $K q = B(q) \tau$ (eq. 18), by Newton's method on the symmetric tangent $K - \partial (B \tau) / \partial q$.
@@ -71,25 +67,26 @@ def solve_projected(projection: Projection, tau: Vector) -> tuple[Float[Array, "
     Derivatives of any order are implicit.
     """
     K = projection.elastic_stiffness()
-    scaling = whitening(K)
+    compliance = lu.inverse(K)
     axial = jnp.sum(projection.weight * projection.sections.stiffness[3])
 
-    def norm(force: Array) -> Array:
-        return jnp.linalg.norm(scaling @ force) / jnp.sqrt(axial)
+    def norm(force: Array, change: Array) -> Array:
+        return jnp.sqrt(jnp.maximum(force @ change, 0.0) / axial)
 
     def imbalance(q: Array) -> Array:
         return projection.integrate(residual(projection.strain(q), projection.sections, tau))
 
     def evaluate(q: Array) -> Evaluation:
         r = imbalance(q)
-        step = _solve(projection.stiffness(tangent(projection.strain(q), projection.sections, tau)), r)
-        definite = ~jnp.any(jnp.isnan(step))
-        step = jnp.where(definite, step, scaling.T @ (scaling @ r))
-        return Evaluation(step, norm(K @ step), norm(r), definite)
+        factors = lu.factor(projection.stiffness(tangent(projection.strain(q), projection.sections, tau)))
+        definite, elastic = jnp.all(jnp.diag(factors) > 0), compliance @ r
+        step = jnp.where(definite, lu.substitute(factors, r), elastic)
+        return Evaluation(step, norm(K @ step, step), norm(r, elastic), definite)
 
     floor = jnp.max(rounding_floor(projection.sections.stiffness, tau)) * K.shape[0] ** 0.5
     q, definite, steps = newton(evaluate, jnp.zeros(K.shape[0], K.dtype), floor)
-    return q, norm(imbalance(q)) <= 16 * floor, definite, steps
+    left = imbalance(q)
+    return q, norm(left, compliance @ left) <= 16 * floor, definite, steps
 
 
 @partial(solve_projected.defjvp, symbolic_zeros=True)
@@ -104,7 +101,7 @@ def _solve_projected_jvp(primals: tuple, tangents: tuple) -> tuple:
 
     change = change_of(imbalance, primals, tangents)
     H = projection.stiffness(tangent(projection.strain(q_sound), projection.sections, forces_where(sound, tau)))
-    return (q, balanced, definite, steps), (-_solve(H, change), *no_derivative(balanced, definite, steps))
+    return (q, balanced, definite, steps), (-lu.solve(H, change), *no_derivative(balanced, definite, steps))
 
 
 class Prescribed(SteppedModel):

@@ -12,11 +12,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from . import component as c
-from .balance import residual, rounding_floor
+from . import component as c, lu
+from .balance import residual
 from .cable import path_length
 from .component import Vector
-from .coupled import Kind, Problem, harmless, size_of_loads, with_tensions
+from .coupled import Kind, Problem, harmless, pull_of, rounding_of, with_tensions
 from .friction import rubbed, turning_rate
 from .implicit import change_of, no_derivative
 from .newton import LOAD_SHARES, Damped, Solution, damped_newton
@@ -71,13 +71,27 @@ def imbalance(unknown: Unknown, basis: Basis, problem: Problem, kind: Kind) -> U
     return Unknown(force, jnp.stack(rows) if rows else unknown.tension)
 
 
-def whitening(K: Float[Array, "dofs dofs"]) -> Float[Array, "dofs dofs"]:
-    """$L^{-1}$ of $K = L L^T$, with which norms and products by $K^{-1}$ are plain products.
+class Measure(NamedTuple):
+    """Sizes of changes of the coordinates: `gram` G with $q^T G q$ the mean square of a change's `shape_size`, and $K^{-1}$."""
 
-    Two of LAPACK's routines must not run side by side in a program: each waits on a thread of XLA's pool for parts of its batch to be
-    done by the others, and on two cores they wait for ever (jaxlib 0.10.2, from batches of some 128 matrices of 24 rows on).
-    """
-    return jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(K), jnp.eye(K.shape[0], dtype=K.dtype), lower=True)
+    gram: Float[Array, "dofs dofs"]
+    compliance: Float[Array, "dofs dofs"]
+
+    def of_change(self, q: Float[Array, " dofs"]) -> Array:
+        """Root of the mean square along the arm."""
+        return jnp.sqrt(jnp.maximum(q @ self.gram @ q, 0.0))
+
+    def of_force(self, force: Float[Array, " dofs"]) -> Array:
+        """Size of the change that a generalised force makes of an arm at rest."""
+        return self.of_change(self.compliance @ force)
+
+
+def measure(matrix: Array, weight: Array, K: Float[Array, "dofs dofs"]) -> Measure:
+    """The `Measure` of a basis, from its matrix (points, 6, n) and the weight [m] of each point."""
+    length = jnp.sum(weight)
+    sizes = jnp.concatenate([jnp.full(3, length), jnp.ones(3, length.dtype)])
+    scaled = sizes[:, None] * matrix
+    return Measure(jnp.einsum("x,xia,xib->ab", weight / length, scaled, scaled), lu.inverse(K))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(2,))
@@ -85,30 +99,28 @@ def solve_prescribed(basis: Basis, problem: Problem, kind: Kind) -> Solution:
     """Equilibrium in the basis, by damped Newton steps from rest. Derivatives are implicit, of any order."""
     sections, weight = problem.sections, problem.grid.weight
     K = jnp.einsum("ij,ijca,cij,ijcb->ab", weight, basis.matrix, jnp.stack(jnp.broadcast_arrays(*sections.stiffness)), basis.matrix)
-    scaling = whitening(K)
     size, length = K.shape[0], jnp.sum(problem.grid.h)
-    axial = jnp.sum(weight * sections.stiffness[3]) / length
-
-    def norm(unknown: Unknown) -> Array:
-        return jnp.sqrt(jnp.sum((scaling @ unknown.q) ** 2) / (axial * length) + jnp.sum((unknown.tension / axial) ** 2))
+    sizes = measure(basis.matrix.reshape(-1, 6, size), weight.reshape(-1), K)
+    axial = jnp.max(sections.stiffness[3])
+    pulls = jnp.stack([jnp.max(pull_of(sections, place, length)) for place in kind.cables]) if kind.cables else jnp.zeros(0, K.dtype)
 
     def evaluate(unknown: Unknown, damping: Array, share: Array) -> Damped:
         part = problem.with_share(share)
         r = imbalance(unknown, basis, part, kind)
         J = _jacobian(unknown, basis, part, kind)
-        J = J.at[:size, :size].add(damping * K)
-        flat = jnp.linalg.solve(J, jnp.concatenate(r))
+        factors = lu.factor(J.at[:size, :size].add(damping * K))
+        flat = lu.substitute(factors, jnp.concatenate(r))
         step = Unknown(flat[:size], flat[size:])
-        solved = jnp.where(jnp.any(jnp.isnan(flat)), jnp.nan, J[:size, :size])  # after the solve, never beside it: see `whitening`
-        definite = ~jnp.any(jnp.isnan(jnp.linalg.cholesky(solved)))
-        return Damped(step, norm(Unknown(K @ step.q, step.tension)), r.q, norm(r), definite)
+        definite = jnp.all(jnp.diag(factors)[:size] > 0)
+        moved = sizes.of_change(step.q) + jnp.sum(pulls * jnp.abs(step.tension))
+        jax.debug.print("d {d} share {s} size {m} merit {r} def {e}", d=damping, s=share, m=moved, r=jnp.sqrt(sizes.of_force(r.q) ** 2 + jnp.sum((r.tension / axial) ** 2)), e=definite)
+        return Damped(step, moved, r.q, jnp.sqrt(sizes.of_force(r.q) ** 2 + jnp.sum((r.tension / axial) ** 2)), definite)
 
     def work(force: Array, step: Unknown) -> Array:
         return jnp.dot(force, step.q)
 
     start = Unknown(jnp.zeros_like(K[0]), jnp.zeros(len(kind.cables), K.dtype))
-    floor = jnp.max(rounding_floor(sections.stiffness, problem.forces)) * (1 + size_of_loads(problem)) * size**0.5
-    return damped_newton(evaluate, work, start, floor, 1 if problem.loads is None else LOAD_SHARES)
+    return damped_newton(evaluate, work, start, rounding_of(problem), 1 if problem.loads is None else LOAD_SHARES)
 
 
 def _jacobian(unknown: Unknown, basis: Basis, problem: Problem, kind: Kind) -> Array:
@@ -132,5 +144,5 @@ def _solve_prescribed_jvp(kind: Kind, primals: tuple, tangents: tuple) -> tuple[
 
     change = change_of(residual_of, primals, tangents)
     J = _jacobian(unknown, primals[0], harmless(primals[1], sound), kind)
-    flat, size = -jnp.linalg.solve(J, change), unknown.q.size
+    flat, size = -lu.solve(J, change), unknown.q.size
     return solution, Solution(Unknown(flat[:size], flat[size:]), *no_derivative(*solution[1:]))

@@ -12,12 +12,14 @@ from .component import Tree
 
 MAX_STEPS = 50
 MAX_DAMPED_STEPS = 200
+MAX_PLAIN_STEPS = 25
 LOAD_SHARES = 5
 _LEAST_FRACTION = 1e-6
 _FAST = 1e-4
 _LEAST_DAMPING, _MOST_DAMPING = 0.1, 1e8
 _RAISE, _LOWER = 10.0, 30.0
 _LEAST_LEFT, _MOST_LEFT = 0.25, 0.99
+_ACCEPTED = 64
 
 
 class Evaluation(NamedTuple):
@@ -107,9 +109,14 @@ def damped_newton(
     what matters of the way is only where it leads. All at once they often make the tangent indefinite at the start.
     The tangent may be approximate. Where it is much too stiff for a soft motion of the arm, what is left of the residual along
     a full step is a share $\rho$ near 1, and the steps shrink by it alone: so the next takes $\rho^2 / (1 - \rho)$ of the last
-    step with it, the rest of the geometric series. The end is reached when an undamped step is negligible, without taking it, so that the
-    residual returned is that of the point returned. Problems may stand side by side, in the last axes of all arrays: each
-    goes its own way and stands still when it is done.
+    step with it, the rest of the geometric series.
+
+    The end is reached where the residual is one that is accepted, the step is undamped, and either the step is negligible or
+    the residual no longer falls by half: rounding. Nothing that would be refused ends the loop before its bounds do. A problem
+    that meets the bound on its evaluations or on $\mu$ gets some plain Newton steps from where it is: these end in an
+    equilibrium that is not stable where there is one nearby. The last step is never taken, so that the residual returned is that
+    of the point returned. Problems may stand side by side, in the last axes of all arrays: each goes its own way and stands
+    still when it is done.
 
     **Arguments:**
     - `evaluate`: maps a point, a damping $\mu$ and the share of the loads to `Damped`.
@@ -119,45 +126,52 @@ def damped_newton(
     **Returns:** a `Solution`; it balances if the residual at the end is rounding or as small as a negligible step.
     """
     small = jnp.finfo(floor.dtype).eps ** 0.75
+    accepted = jnp.maximum(_ACCEPTED * floor, small)
 
     def pending(guard: _Guard) -> Array:
-        done = guard.fresh & (guard.damping == 0) & ((guard.size < small) | (guard.merit < floor))
+        negligible = (guard.size < small) | guard.stalled
+        done = guard.fresh & (guard.damping == 0) & (guard.merit <= accepted) & negligible
         stuck = ~guard.definite & (guard.merit < floor)
-        enough = (done | stuck) & (guard.given == shares)
-        return (guard.spent < MAX_DAMPED_STEPS) & ~enough & (guard.damping < _MOST_DAMPING)
+        return ~((done | stuck) & (guard.given == shares)) & (guard.plain < MAX_PLAIN_STEPS)
 
     def advance(state: tuple) -> tuple:
         x, step, old = state
+        plain = (old.spent >= MAX_DAMPED_STEPS) | (old.damping >= _MOST_DAMPING) | (old.plain > 0)
         trial = jax.tree.map(lambda a, s: jnp.where(old.fresh, a - s.astype(a.dtype), a), x, step)
-        damping = jnp.where(old.fresh, _lowered(old.damping), old.damping)
-        given = jnp.where(old.fresh, jnp.minimum(old.given + 1, shares), old.given)
+        damping = jnp.where(plain, 0.0, jnp.where(old.fresh, _lowered(old.damping), old.damping))
+        given = jnp.where(plain, shares, jnp.where(old.fresh, jnp.minimum(old.given + 1, shares), old.given))
         new = evaluate(trial, damping, given / shares)
         left = work(new.residual, step)
-        better = (old.given < shares) | (left >= -old.pull) | (new.merit < old.merit) | (new.merit < floor)
+        better = (old.given < shares) | (left >= -old.pull) | (new.merit < old.merit) | (new.merit < floor) | plain
         taken = ~old.fresh | (jnp.isfinite(new.merit) & better)
-        damping = jnp.where(taken & new.definite, damping, _raised(jnp.where(taken, damping, old.damping)))
-        whole = (old.damping == 0) & (damping == 0) & old.fresh & (old.given == shares) & (new.merit > 4 * floor)
-        more = jnp.where(whole, _extrapolated(jnp.minimum(left / old.pull, new.size / old.size)), 0.0)
+        damping = jnp.where(taken & (new.definite | plain), damping, _raised(jnp.where(taken, damping, old.damping)))
+        whole = (old.damping == 0) & (damping == 0) & old.fresh & (old.given == shares)
+        more = _extrapolated(jnp.minimum(left / old.pull, new.size / old.size))
+        more = jnp.where(whole & (new.merit > 4 * floor), more, 0.0)
         new = new._replace(step=jax.tree.map(lambda s, last: s + more.astype(s.dtype) * last, new.step, step))
-        there = _Guard(new.size, new.merit, new.definite, work(new.residual, new.step), damping, given, new.definite, old.spent)
-        here = old._replace(damping=damping, fresh=jnp.zeros_like(taken))
-        guard = _where(taken, there, here)._replace(spent=old.spent + 1)
-        # a step that is not taken is found anew with more damping before it is used, and that of a problem that is done never is
+        stalled = whole & (new.merit > 0.5 * old.merit)
+        there = _Guard(
+            new.size, new.merit, new.definite, work(new.residual, new.step), damping, given, new.definite | plain, stalled, old.spent, old.plain
+        )
+        here = old._replace(damping=damping, fresh=plain)
+        guard = _where(taken, there, here)._replace(spent=old.spent + 1, plain=old.plain + plain)
+        # a step that is not taken is computed again with more damping before it is used, and that of a problem that is done never is
         go = pending(old)
         return _where(go & taken, trial, x), new.step, _where(go, guard, old)
 
     zero, no = jnp.zeros_like(floor), jnp.zeros(floor.shape, bool)
     damping = jnp.full_like(floor, _LEAST_DAMPING if shares == 1 else 0.0)
-    guard = _Guard(zero, zero + jnp.inf, ~no, zero, damping, zero + 1, no, jnp.zeros(floor.shape, jnp.int32))
+    count = jnp.zeros(floor.shape, jnp.int32)
+    guard = _Guard(zero, zero + jnp.inf, ~no, zero, damping, zero + 1, no, no, count, count)
     step = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(evaluate, start, floor, floor).step)
     x, _, guard = lax.while_loop(lambda state: jnp.any(pending(state[2])), advance, (start, step, guard))
-    return Solution(x, guard.merit <= jnp.maximum(64 * floor, small), guard.definite, guard.spent)
+    return Solution(x, guard.merit <= accepted, guard.definite, guard.spent)
 
 
 class _Guard(NamedTuple):
     """What `damped_newton` keeps of each problem besides the point and the step: size of the step, of the residual, whether
     the tangent is definite, the work of the residual over the step; damping, shares of the loads so far, whether the step may
-    be tried, evaluations so far."""
+    be tried, whether the last undamped step left more than half of the residual, evaluations so far, and the plain ones of them."""
 
     size: Array
     merit: Array
@@ -166,7 +180,9 @@ class _Guard(NamedTuple):
     damping: Array
     given: Array
     fresh: Array
+    stalled: Array
     spent: Array
+    plain: Array
 
 
 def _extrapolated(left: Array) -> Array:
