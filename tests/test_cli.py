@@ -175,7 +175,13 @@ def test_sweep_keeps_and_draws_a_workspace(tmp_path, capsys):
     assert "inputs      -15 to -1\nsamples     50 converged\ntip x" in out
     assert (tmp_path / "w.png").stat().st_size > 10_000
     kept = pytest.importorskip("zarr").open_group(tmp_path / "w.zarr", mode="r")
-    assert {name: kept[name].shape for name in kept} == {"inputs": (50, 1), "tip": (50, 4, 4), "lengths": (50, 1), "status": (50,)}
+    shapes = {"inputs": (50, 1), "tip": (50, 4, 4), "lengths": (50, 1), "status": (50,)}
+    assert {name: kept[name].shape for name in shapes} == shapes
+    (tmp_path / "w.zarr" / "status" / "c" / "0").unlink()
+    assert cli.main([*arguments, "--out", str(tmp_path / "w.zarr")]) == cli_common.DONE
+    said = capsys.readouterr().err.splitlines()[0]
+    assert said.startswith(f"vsr-jax: sweep.out: {tmp_path / 'w.zarr'} has missing or damaged chunks")
+    assert said.endswith(": status[0:50]")
 
 
 def test_a_sweep_to_disk_without_zarr_is_one_line(tmp_path, capsys, monkeypatch):

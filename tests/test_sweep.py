@@ -1,6 +1,8 @@
 """Sweeps: the same numbers as one solve after the other, whatever the chunks, devices, processes and interruptions."""
 
 import os
+import pathlib
+import shutil
 import signal
 import socket
 import subprocess
@@ -15,6 +17,9 @@ import pytest
 
 import vsr_jax as vsr
 from vsr_jax import archive
+from vsr_jax.labels import labels
+from vsr_jax.parallel import Task
+from vsr_jax.scenefile import parse_scene
 
 MODEL = vsr.StrainDependent(2)
 SETUP = """
@@ -110,15 +115,178 @@ def test_an_interrupted_sweep_goes_on_where_it_stopped(tmp_path, expected, monke
     assert len(written) == 6
 
 
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    """A finished sweep on disk, of six chunks."""
+    path = tmp_path_factory.mktemp("store") / "sweep.zarr"
+    vsr.sweep(arm(0.006), inputs, model=MODEL, out=path, chunk=4, progress=False)
+    return path
+
+
+def again(path):
+    return vsr.sweep(arm(0.006), inputs, model=MODEL, out=path, progress=False)
+
+
+def contents(path):
+    return {str(file.relative_to(path)): file.read_bytes() for file in path.rglob("*") if file.is_file()}
+
+
+def flipped(file):
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 4
+    file.write_bytes(data)
+
+
+DAMAGE = {
+    "deleted": lambda file: file.unlink(),
+    "flipped": flipped,
+    "truncated": lambda file: file.write_bytes(file.read_bytes()[:-7]),
+    "emptied": lambda file: file.write_bytes(b""),
+}
+
+
+@pytest.mark.parametrize("chunk", [2, 5])
+@pytest.mark.parametrize("name", ["tip", "status", "inputs"])
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_damaged_chunk_is_made_again(tmp_path, store, expected, damage, name, chunk):
+    path = shutil.copytree(store, tmp_path / "sweep.zarr")
+    DAMAGE[damage](path / name / "c" / str(chunk) / "/".join("0" * {"tip": 2, "status": 0, "inputs": 1}[name]))
+    with pytest.warns(UserWarning, match=rf"missing or damaged chunks, .*: {name}\[{4 * chunk}:{min(4 * chunk + 4, 23)}\]$"):
+        result = again(path)
+    np.testing.assert_array_equal(result["tip"][:], expected)
+    assert contents(path) == contents(store)
+    again(path)  # without a warning, which would be an error
+
+
+def test_damage_is_found_before_a_sweep_has_ended(tmp_path, store, monkeypatch):
+    path, write = tmp_path / "sweep.zarr", archive.Archive.write
+
+    def interrupted(self, index, arrays):
+        if index == 4:
+            raise KeyboardInterrupt
+        write(self, index, arrays)
+
+    monkeypatch.setattr(archive.Archive, "write", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        vsr.sweep(arm(0.006), inputs, model=MODEL, out=path, chunk=4, progress=False)
+    monkeypatch.undo()
+    flipped(path / "tip" / "c" / "1" / "0" / "0")
+    (path / "tip" / "c" / "3" / "0" / "0").unlink()
+    flipped(path / "inputs" / "c" / "5" / "0")
+    flipped(path / "actuator_type" / "c" / "0")
+    with pytest.warns(UserWarning, match=r"computed again\): actuator_type\[0:2\], tip\[4:8\], tip\[12:16\], inputs\[20:23\]$"):
+        again(path)
+    assert contents(path) == contents(store)
+
+
+def test_a_chunk_in_which_every_sample_failed_is_no_damage(tmp_path):
+    bad = np.where(np.arange(23)[:, None] // 4 == 2, np.nan, inputs)
+    for _ in range(2):
+        result = vsr.sweep(arm(0.006), bad, model=MODEL, out=tmp_path / "sweep.zarr", chunk=4, progress=False)
+    assert result.counts == {"converged": 19, "not_finite": 4}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+@pytest.mark.parametrize("file", ["zarr.json", "tip/zarr.json", "status/zarr.json", "actuator/zarr.json"])
+def test_damaged_metadata_is_one_line(tmp_path, store, file, damage):
+    path = shutil.copytree(store, tmp_path / "sweep.zarr")
+    DAMAGE[damage](path / file)
+    needed = r"holds no sweep \(no zarr.json\)" if (file, damage) == ("zarr.json", "deleted") else "metadata in .* are damaged"
+    with pytest.raises(ValueError, match=f"sweep.out: .*{needed}"):
+        again(path)
+
+
+def test_two_sweeps_do_not_write_at_once(tmp_path, store, monkeypatch):
+    path, write, refused = tmp_path / "sweep.zarr", archive.Archive.write, []
+
+    def disturbed(self, index, arrays):
+        if not refused:
+            with pytest.raises(ValueError, match="another sweep is writing to") as error:
+                again(path)
+            refused.append(error)
+        write(self, index, arrays)
+
+    monkeypatch.setattr(archive.Archive, "write", disturbed)
+    vsr.sweep(arm(0.006), inputs, model=MODEL, out=path, chunk=4, progress=False)
+    assert refused
+    assert contents(path) == contents(store)
+
+
+def test_two_sweeps_make_one_folder_at_once(tmp_path, store, monkeypatch):
+    path, rename = tmp_path / "sweep.zarr", pathlib.Path.rename
+
+    def overtaken(draft, target):
+        if not path.exists():
+            shutil.copytree(store, path)
+        return rename(draft, target)
+
+    monkeypatch.setattr(pathlib.Path, "rename", overtaken)
+    again(path)
+    assert contents(path) == contents(store)
+    assert [file.name for file in tmp_path.iterdir()] == ["sweep.zarr"]
+
+
 def test_xarray_reads_a_sweep(tmp_path, expected):
-    xarray = pytest.importorskip("xarray")
-    vsr.sweep(arm(0.006), inputs, model=MODEL, outputs=("tip", "lengths"), out=tmp_path / "sweep.zarr", chunk=4, progress=False)
-    data = xarray.open_zarr(tmp_path / "sweep.zarr", consolidated=False)
-    np.testing.assert_array_equal(data["tip"], expected)
+    xarray, path = pytest.importorskip("xarray"), tmp_path / "sweep.zarr"
+    vsr.sweep(arm(0.006), inputs, model=MODEL, outputs=("tip", "lengths", "q", "steps"), out=path, chunk=4, progress=False)
+    data = xarray.open_zarr(path)  # without a warning, which would be an error
     np.testing.assert_array_equal(data["inputs"], inputs)
-    assert data["lengths"].attrs["units"] == "m"
+    np.testing.assert_array_equal(data["tip"].sel(column="position", row=["x", "y", "z"]), expected[:, :3, 3])
+    dims = {"inputs": ("actuator",), "tip": ("row", "column"), "lengths": ("actuator",), "q": ("actuator",), "steps": (), "status": ()}
+    assert {name: x.dims for name, x in data.data_vars.items()} == {name: ("sample", *more) for name, more in dims.items()}
+    assert set(data.coords) == {"actuator", "actuator_type", "input_units", "row", "column", "column_units"}
+    units = {"inputs": "see input_units", "tip": "see column_units", "lengths": "m", "q": "N", "steps": "1", "status": None}
+    assert {name: x.attrs.get("units") for name, x in data.data_vars.items()} == units
+    assert all(x.attrs["long_name"] for x in data.variables.values())
+    assert list(data["input_units"].values) == ["N", "Pa"]
+    assert list(data["actuator_type"].values) == ["Tendon", "Chamber"]
+    assert list(data["column_units"].values) == ["1", "1", "1", "m"]
     assert data["status"].attrs["flag_meanings"].startswith("converged max_steps unstable")
-    assert data["tip"].dims[0] == data["status"].dims[0] == "sample"
+    assert data.attrs["source"] == f"vsr_jax {vsr.__version__}"
+    assert (data.attrs["model"], data.attrs["precision"]) == ("StrainDependent(steps=2, order=6)", "float64")
+    assert eqx.tree_equal(parse_scene(data.attrs["scene"]).scene, arm(0.006))
+
+
+def labelled(scene, samples, outputs, model=MODEL):
+    task = Task(scene, model, outputs)
+    samples = jax.tree.map(np.asarray, samples)
+    like = jax.eval_shape(jax.vmap(lambda sample: task(sample)), samples)
+    return labels(
+        task, like, samples, {f"inputs_{name}": x for name, x in samples.items()} if isinstance(samples, dict) else {"inputs": samples}
+    )
+
+
+def test_labels_of_coordinates_and_of_what_a_function_returns():
+    basis = vsr.Basis({"elongation": vsr.Legendre(0), "bending_y": vsr.Monomial(1)})
+    found = labelled(arm(0.006), inputs, ("q",), vsr.Prescribed(basis))
+    assert found.arrays["q"].dims == ("sample", "dof")
+    assert list(found.coordinates["dof"]) == ["bending_y_0", "bending_y_1", "elongation_0"]
+    assert list(found.coordinates["dof_units"]) == ["1/m", "1/m", "1"]
+    samples = {"radius": np.full(23, 0.006), "u": inputs}
+    found = labelled(lambda s: (arm(s["radius"]), s["u"]), samples, lambda eq: {"tip": eq.tip[:3], "l": eq.lengths})
+    dims = {name: found.arrays[name].dims for name in ("inputs_u", "tip")}
+    assert dims == {"inputs_u": ("sample", "inputs_u_dim_1"), "tip": ("sample", "tip_dim_1", "tip_dim_2")}
+    assert list(found.coordinates["input_units"]) == ["N", "Pa"]
+    assert "scene" not in found.attributes
+    for name in ("actuator", "sample", "a/b"):
+        with pytest.raises(ValueError, match=f"sweep.outputs: got '{name}', need for a store a name without / and none of a"):
+            labelled(arm(0.006), inputs, lambda eq, name=name: {name: eq.tip})
+
+
+def test_an_arm_without_actuators_and_outputs_of_any_kind(tmp_path):
+    xarray, scene = pytest.importorskip("xarray"), vsr.Scene(arm(0.006).rod)
+    for _ in range(2):
+        result = vsr.sweep(
+            scene,
+            np.zeros((3, 0)),
+            outputs=lambda eq: {"lengths": eq.lengths, "right": eq.converged, "small": eq.steps.astype("uint8")},
+            model=MODEL,
+            out=tmp_path / "sweep.zarr",
+            chunk=2,
+            progress=False,
+        )
+    assert result["lengths"].shape == (3, 0)
+    assert xarray.open_zarr(tmp_path / "sweep.zarr")["right"].values.tolist() == [True] * 3
 
 
 def test_another_sweep_is_refused(tmp_path):
@@ -184,11 +352,19 @@ def test_two_processes_give_the_same_in_memory_and_on_disk(tmp_path, expected):
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
     code = """
+import warnings
+from jax.experimental import multihost_utils
 number, folder = int(os.environ["NUMBER"]), os.environ["TO"]
 jax.distributed.initialize(os.environ["ADDRESS"], num_processes=2, process_id=number)
 result = vsr.sweep(arm(0.006), inputs, model=model, chunk=5, progress=False)
 np.save(f"{folder}/{number}.npy", result["tip"])
 vsr.sweep(arm(0.006), inputs, model=model, chunk=5, out=f"{folder}/sweep.zarr", progress=False)
+multihost_utils.sync_global_devices("written")
+os.remove(f"{folder}/sweep.zarr/tip/c/{2 + number}/0/0")  # each finds damage in its own chunks
+with warnings.catch_warnings(record=True) as said:
+    warnings.simplefilter("always")
+    vsr.sweep(arm(0.006), inputs, model=model, out=f"{folder}/sweep.zarr", progress=False)
+assert [str(x.message).split(": ")[-1] for x in said if "computed again" in str(x.message)] == [f"tip[{10 + 5 * number}:{15 + 5 * number}]"]
 """
     both = [started(code, NUMBER=str(number), ADDRESS=address, TO=str(tmp_path)) for number in (0, 1)]
     for process in both:

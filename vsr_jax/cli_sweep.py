@@ -1,7 +1,9 @@
 """The command `sweep`: a scene file solved for many inputs, a workspace in one command."""
 
 import argparse
+import sys
 import time
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +46,10 @@ def _sweep(options: argparse.Namespace) -> int:
     model = model_between(task, options.tolerance, low, high)
     outputs = tuple(dict.fromkeys([*options.outputs, "tip"]))
     start = time.perf_counter()
-    result = sweep(task.scene, inputs, outputs=outputs, model=model, out=options.out)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("always", message="sweep.out")
+        warnings.showwarning = lambda message, *_, **__: print(f"vsr-jax: {message}", file=sys.stderr)
+        result = sweep(task.scene, inputs, outputs=outputs, model=model, out=options.out)
     seconds = time.perf_counter() - start
     tips = np.asarray(result["tip"])[:, :3, 3]
     print("\n".join(_lines(task.title or options.scene, low, high, result, tips)))

@@ -30,8 +30,12 @@ class Task(eqx.Module):
     model: Model | None
     outputs: tuple[str, ...] | Callable = eqx.field(static=True)
 
+    def given(self, sample: Any) -> tuple[Scene, Any]:
+        """Scene and inputs of a sample."""
+        return (self.scene, sample) if isinstance(self.scene, Scene) else self.scene(sample)
+
     def __call__(self, sample: Any) -> dict[str, Any]:
-        scene, inputs = (self.scene, sample) if isinstance(self.scene, Scene) else self.scene(sample)
+        scene, inputs = self.given(sample)
         eq = solve(scene, inputs, model=self.model)
         if callable(self.outputs):
             wanted = self.outputs(eq)
@@ -90,10 +94,10 @@ def _solved(task: Task, samples: Any, lanes: int, mesh: Mesh) -> dict[str, Any]:
     arrays, static = eqx.partition(task, eqx.is_array)
 
     def part(arrays: Any, samples: Any) -> dict[str, Any]:
-        rows = jax.tree.map(lambda x: x.reshape(-1, lanes, *x.shape[1:]), samples)
+        rows = jax.tree.map(lambda x: x.reshape(len(x) // lanes, lanes, *x.shape[1:]), samples)
         task = eqx.combine(arrays, static)
         outputs = lax.map(jax.vmap(lambda sample: task(sample)), rows)  # JAX writes out the name of what it maps, a scene at length
-        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), outputs)
+        return jax.tree.map(lambda x: x.reshape(len(x) * lanes, *x.shape[2:]), outputs)
 
     split = PartitionSpec("samples")
     return jax.shard_map(part, mesh=mesh, in_specs=(PartitionSpec(), split), out_specs=split, check_vma=False)(arrays, samples)

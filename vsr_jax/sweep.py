@@ -14,6 +14,7 @@ from ._check import count
 from .archive import Archive, InMemory
 from .equilibrium import Equilibrium
 from .fingerprint import fingerprint
+from .labels import labels
 from .model import Model, Status
 from .parallel import Program, Task, number
 from .scene import Scene
@@ -89,17 +90,30 @@ def sweep(
     - `outputs`: names among `tip`, `lengths`, `forces`, `slack`, `stability`, `condition`, `q` and `steps`, or a function from an
       `Equilibrium` to arrays by name; only what is asked for is computed.
     - `model`: as for `solve`.
-    - `out`: a folder for Zarr (`pip install "vsr-jax[sweep]"`), which xarray reads. Each chunk is written when it is done. The same
-      call goes on where a killed one stopped, with the same result, to the bit on the same devices.
+    - `out`: a folder for Zarr (`pip install "vsr-jax[sweep]"`), which `xarray.open_zarr` reads: see below. Each chunk is written
+      when it is done. The same call resumes a sweep that was killed, and reads one that has finished; results are bit-identical on
+      the same devices.
     - `chunk`: samples in a chunk, 16,384 by default, of which other devices than CPUs get one each; a folder keeps its own.
     - `memory`: bound [bytes] on the intermediate values of the compiled program, by which fewer samples are solved side by side.
     - `devices`: those of this process that take part, all by default.
     - `progress`: whether to show a bar with rate and remaining time.
 
+    **The store:** `tip` has the dimensions (sample, row, column), `inputs`, `lengths`, `forces` and `slack` (sample, actuator), `q`
+    (sample, dof), or (sample, actuator) where it is the thread forces; outputs of a function have (sample, NAME_dim_1, ...), and so
+    have the samples given to a function of the scene. Units are attributes, or coordinates where they differ: `input_units`,
+    `column_units`, `dof_units`. `data.tip.sel(column="position", row=["x", "y", "z"])` is the tip's place. The attributes hold the
+    model, the precision, the version and, as TOML, a scene that has no Python functions.
+
+    Every chunk has a checksum (CRC-32C). Each call reads all chunks once to verify them, which takes little time compared to
+    solving them; what is missing or damaged is computed again, with one warning. One sweep at a time writes to a folder.
+
     **Returns:** a `Sweep`, whole in every process.
 
     **Raises:** `ValueError` for samples of a wrong shape or of different numbers, an unknown output, a bound on memory that not
-    even one sample keeps, or an `out` that holds something else; `ImportError` where Zarr is missing.
+    even one sample keeps, an `out` that holds something else or whose metadata are damaged, or one to which another sweep is
+    writing; `ImportError` where Zarr is missing.
+
+    **Warns:** `UserWarning` where chunks in `out` are missing or damaged, with their names and samples.
     """
     task = Task(scene, model, _named(outputs))
     samples = _samples(scene, inputs)
@@ -107,12 +121,12 @@ def sweep(
     like = jax.eval_shape(jax.vmap(lambda sample: task(sample)), samples)
     local = Mesh(np.array(jax.local_devices() if devices is None else list(devices)), ("samples",))
     size = min(_chunk(local) if chunk is None else count("sweep.chunk", chunk), total)
-    archive = InMemory(like, size) if out is None else Archive(out, like, _flat(samples), size, _digest(task, samples))
-    mine = range(jax.process_index(), -(-total // archive.chunk), jax.process_count())
-    missing = [i for i in mine if not archive.has(i)]
-    if missing:
-        program = Program(task, samples, archive.chunk, local, count("sweep.memory", memory))
-        _run(program, missing, archive, progress and jax.process_index() == 0)
+    archive = InMemory(like, size) if out is None else _archive(out, task, like, samples, size)
+    missing = archive.missing(range(jax.process_index(), -(-total // archive.chunk), jax.process_count()))
+    with archive.writing():
+        if missing:
+            program = Program(task, samples, archive.chunk, local, count("sweep.memory", memory))
+            _run(program, missing, archive, progress and jax.process_index() == 0)
     return Sweep(archive.arrays())
 
 
@@ -171,5 +185,7 @@ def _flat(samples: Any) -> dict[str, np.ndarray]:
     return {"_".join(["inputs", *re.findall(r"\w+", jax.tree_util.keystr(path))]): x for path, x in leaves}
 
 
-def _digest(task: Task, samples: Any) -> str:
-    return fingerprint(task, (jax.tree.map(lambda x: x[0], samples),), samples)
+def _archive(out: str | os.PathLike, task: Task, like: Mapping[str, Any], samples: Any, chunk: int) -> Archive:
+    flat = _flat(samples)
+    digest = fingerprint(task, (jax.tree.map(lambda x: x[0], samples),), samples)
+    return Archive(out, like, flat, chunk, labels(task, like, samples, flat), digest)
