@@ -106,8 +106,11 @@ class Continuum(Model):
     def nodes(self, scene: Scene, forces: Vector, state: Found) -> Nodes:
         grid = self.derivative.grid(scene)
         xi = tuple(x.reshape(grid.X.shape) for x in self.strain(scene, forces, state, grid.X.reshape(-1)))
-        turning = self.derivative.solve(scene, state.inputs).state.turning if scene.rubbing else ()
-        return Nodes(grid, xi, scene.sections(grid.X), shares_at(scene, turning, grid, grid.X))
+        if not scene.rubbing:
+            sections = scene.sections(grid.X)
+            return Nodes(grid, xi, sections, sections.reach)
+        on_steps = self.derivative.solve(scene, state.inputs).state
+        return Nodes(grid, xi, scene.sections(grid.X), shares_at(scene, on_steps.xi, on_steps.turning, grid, grid.X))
 
     def finer(self) -> "Continuum":
         return replace(self, rtol=0.01 * self.rtol, atol=0.01 * self.atol)
@@ -191,7 +194,7 @@ def _shoot(model: Continuum, scene: Scene, inputs: Array) -> tuple[Shot, Guess, 
     steps = model.derivative
     found = steps.solve(scene, inputs)
     grid, segments = steps.grid(scene), make_grid(scene.edges(), model.segments, 1)
-    guess = Guess(grid, found.forces, found.state.turning)
+    guess = Guess(grid, found.state.xi, found.forces, found.state.turning)
     loads = loading(scene, grid)
     zero = jnp.zeros_like(segments.start)
     wrench = (zero,) * 6 if loads is None else react_at(found.state.xi, grid, loads, segments.start)

@@ -22,7 +22,7 @@ from .actuator import Tendon
 from .balance import chosen, residual, thread_direction, thread_wrench
 from .cable import Cable, cable_of, path_length
 from .component import Vector
-from .friction import Rubbing, decay_at, reaction_rate, rubbed, strain_rate, turning_rate
+from .friction import Rubbing, breaks_of, decay_at, kinks_of, reaction_rate, rubbed, strain_rate, turning_rate
 from .quadrature import Grid
 from .reaction import Loading, Reaction, loading, react
 from .scene import CrossSections, Scene, shared
@@ -85,7 +85,7 @@ def problem_of(scene: Scene, inputs: Array, grid: Grid) -> tuple[Problem, Kind]:
     rubbing = None
     if scene.rubbing:
         _, rate = jax.jvp(scene.sections, (grid.X,), (jnp.ones_like(grid.X),))
-        rubbing = Rubbing(tuple(_signed_friction(scene, place) for place in scene.rubbing), rate)
+        rubbing = Rubbing(tuple(_signed_friction(scene, p) for p in scene.rubbing), rate, breaks_of(scene.breakpoints, grid))
     problem = Problem(grid, sections, forces, loading(scene, grid), tuple(cables), rubbing)
     return problem, Kind(scene.free, scene.length_driven, scene.rubbing)
 
@@ -120,7 +120,8 @@ def state_of(unknown: Unknown, problem: Problem, kind: Kind) -> State:
     carried = list(sections.reach)
     if problem.rubbing is not None:
         for place, turning, mu in zip(kind.rubbing, unknown.turning, problem.rubbing.coefficients, strict=True):
-            carried[place] = rubbed(carried[place], turning, mu, grid)
+            kinks = kinks_of(xi, sections, problem.rubbing.breaks, place, grid)
+            carried[place] = rubbed(carried[place], turning, kinks, mu, grid)
     forces = with_tensions(problem.forces, unknown.tension, kind)
     tau = shared(forces, tuple(carried))
     along = None if problem.loads is None else react(xi, grid, problem.loads)
@@ -131,12 +132,15 @@ def state_of(unknown: Unknown, problem: Problem, kind: Kind) -> State:
     return State(tuple(carried), tau, along, slack)
 
 
-def shares_at(scene: Scene, turning: Vector, grid: Grid, X: Array) -> tuple[Array | None, ...]:
-    """Share of each thread's force at abscissas X of any shape, from the turning rates at the nodes of a grid."""
+def shares_at(scene: Scene, xi: Vector, turning: Vector, grid: Grid, X: Array) -> tuple[Array | None, ...]:
+    """Share of each thread's force at abscissas X of any shape, from strain and turning rates at the nodes of a grid."""
     shares = list(scene.sections(X).reach)
+    if not scene.rubbing:
+        return tuple(shares)
+    sections, breaks = scene.sections(grid.X), breaks_of(scene.breakpoints, grid)
     for place, rate in zip(scene.rubbing, turning, strict=True):
-        reach = scene.sections(grid.X).reach[place]
-        left = decay_at(rate if reach is None else reach * rate, _signed_friction(scene, place), grid, X)
+        reach, kinks = sections.reach[place], kinks_of(xi, sections, breaks, place, grid)
+        left = decay_at(rate if reach is None else reach * rate, kinks, _signed_friction(scene, place), grid, X)
         here = shares[place]
         shares[place] = left if here is None else here * left
     return tuple(shares)

@@ -1,29 +1,36 @@
 r"""Solution of the coupled balance (see `coupled`): damped Newton steps with a tangent that is nearly exact, and implicit derivatives."""
 
-from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.custom_batching import custom_vmap
 from jaxtyping import Array
 
 from . import component as c
 from .balance import chosen, solve_balance, spread, with_locked
+from .batching import arms_in, side_by_side
 from .component import Vector
-from .coupled import Imbalance, Kind, Problem, State, Unknown, harmless, imbalance_of, pull_of, rounding_of, shape_of, shape_size, state_of, with_tensions
+from .coupled import (
+    Imbalance,
+    Kind,
+    Problem,
+    State,
+    Unknown,
+    harmless,
+    imbalance_of,
+    pull_of,
+    rounding_of,
+    shape_of,
+    shape_size,
+    state_of,
+    with_tensions,
+)
 from .coupled_tangent import approximate_solve, tangent_solve
 from .implicit import change_of, no_derivative
-from .newton import LOAD_SHARES, Damped, Solution, damped_newton
+from .newton import LOAD_SHARES, MOST_TURN, Damped, Solution, damped_newton
 from .quadrature import Grid
 from .scene import CrossSections
-
-_MOST_TURN = 1.5
-"""Bound on how far [rad] one Newton step may turn the arm's end."""
-
-_ALIASED = 64
-"""Arms side by side come in no multiple of this: their rows would all fall on the same few lines of a processor's cache."""
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(1,))
@@ -33,7 +40,7 @@ def solve_arm(problem: Problem, kind: Kind) -> Solution:
     Derivatives are implicit, of any order, in forward and reverse mode: the exact tangent is solved by refining
     `approximate_solve`.
     """
-    return _side_by_side(kind)(_start(problem, kind), problem)
+    return side_by_side(partial(_solve, kind))(_start(problem, kind), problem)
 
 
 @partial(solve_arm.defjvp, symbolic_zeros=True)
@@ -78,30 +85,6 @@ def _start(problem: Problem, kind: Kind) -> Unknown:
     return Unknown(xi, tension, (jnp.zeros_like(xi[0]),) * len(kind.rubbing))
 
 
-def _side_by_side(kind: Kind) -> Callable[[Unknown, Problem], Solution]:
-    """`_solve` with another rule for `jax.vmap`: the batch goes into the last axis.
-
-    Passes along the arm then read and write whole rows. With the batch in front every array that goes through a pass is
-    transposed on the way in and out, which took most of the time. Eight more arms, copies of the last, cost less than rows of
-    a power of two.
-    """
-
-    @custom_vmap
-    def solve(start: Unknown, problem: Problem) -> Solution:
-        return _solve(start, problem, kind)
-
-    @solve.def_vmap
-    def _(size: int, batched: list, *arguments: Any) -> tuple[Solution, Any]:
-        lanes = size + 8 if size % _ALIASED == 0 else size
-        place = jnp.minimum(jnp.arange(lanes), size - 1)
-        rows = jax.tree.map(lambda x, along: jnp.moveaxis(x[place], 0, -1) if along else x[..., None], arguments, tuple(batched))
-        start = jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], lanes)), rows[0])
-        solution = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0)[:size], solve(start, rows[1]))
-        return solution, jax.tree.map(lambda _: True, solution)
-
-    return solve
-
-
 class _Sizes(NamedTuple):
     """Sizes of steps and imbalances without unit, one for each of the arms side by side (see `shape_size`)."""
 
@@ -116,7 +99,9 @@ class _Sizes(NamedTuple):
 
     def of_step(self, step: Unknown, at: State) -> Array:
         """Largest change of the shape, of what a tension does to it, or of what friction takes of one."""
-        tensions = [tension * pull_of(self.sections, place, self.length) for place, tension in zip(self.kind.cables, step.tension, strict=True)]
+        tensions = [
+            tension * pull_of(self.sections, place, self.length) for place, tension in zip(self.kind.cables, step.tension, strict=True)
+        ]
         moved = self._largest(shape_size(step.xi, self.length))
         return sum((self._largest(x) for x in (*tensions, *self._rubbed(step.turning, at))), moved)
 
@@ -150,8 +135,10 @@ class _Sizes(NamedTuple):
         return jnp.max(jnp.abs(x), axis=self._inner(x))
 
 
-def _solve(start: Unknown, whole: Problem, kind: Kind) -> Solution:
-    sizes = _Sizes(whole.grid, whole.sections, kind, start.xi[0].shape[2:])
+def _solve(kind: Kind, start: Unknown, whole: Problem) -> Solution:
+    arms = arms_in((start, whole), whole.grid.h.ndim - 1)
+    start = jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[: x.ndim - len(arms)], *arms)), start)
+    sizes = _Sizes(whole.grid, whole.sections, kind, arms)
 
     def evaluate(unknown: Unknown, damping: Array, share: Array) -> Damped:
         problem = whole.with_share(share)
@@ -160,10 +147,9 @@ def _solve(start: Unknown, whole: Problem, kind: Kind) -> Solution:
         step, definite = approximate_solve(unknown, at, imbalance, problem, kind, damping)
         size = sizes.of_step(step, at)
         # A step that coils the arm may well lower the residual, and lead nowhere.
-        cut = jnp.minimum(1.0, _MOST_TURN / jnp.maximum(sizes.turn(step), _MOST_TURN))
+        cut = jnp.minimum(1.0, MOST_TURN / jnp.maximum(sizes.turn(step), MOST_TURN))
         step = jax.tree.map(lambda x: cut.astype(x.dtype) * x, step)
         return Damped(step, size, c.single(imbalance.wrench), sizes.of_imbalance(imbalance, at), definite)
 
-    floor = rounding_of(whole)
     shares = 1 if whole.loads is None else LOAD_SHARES
-    return damped_newton(evaluate, sizes.work, start, jnp.broadcast_to(floor, sizes.arms), shares)
+    return damped_newton(evaluate, sizes.work, start, jnp.broadcast_to(rounding_of(whole), arms), shares)

@@ -158,6 +158,6 @@ def _refined(apply: Callable, nearly: Callable, right: Array) -> Array:
         return x + part * p, r - part * q, P.at[place].set(p), Q.at[place].set(q), count + 1
 
     kept = jnp.zeros((_KEPT, *right.shape), right.dtype)
-    x, *_, count = lax.while_loop(proceed, advance, (jnp.zeros_like(right), right, kept, kept, 0))
+    x, *_ = lax.while_loop(proceed, advance, (jnp.zeros_like(right), right, kept, kept, 0))
     found = jnp.linalg.norm(right - apply(x)) <= _ACCEPTED * eps * whole(x)  # no derivative rather than a wrong one
     return jnp.where(found, x, jnp.nan)

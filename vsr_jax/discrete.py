@@ -67,7 +67,7 @@ def solve_projected(projection: Projection, tau: Vector) -> tuple[Float[Array, "
     Derivatives of any order are implicit.
     """
     K = projection.elastic_stiffness()
-    compliance = lu.inverse(K)
+    elastic = lu.factor(K)
     axial = jnp.sum(projection.weight * projection.sections.stiffness[3])
 
     def norm(force: Array, change: Array) -> Array:
@@ -79,14 +79,14 @@ def solve_projected(projection: Projection, tau: Vector) -> tuple[Float[Array, "
     def evaluate(q: Array) -> Evaluation:
         r = imbalance(q)
         factors = lu.factor(projection.stiffness(tangent(projection.strain(q), projection.sections, tau)))
-        definite, elastic = jnp.all(jnp.diag(factors) > 0), compliance @ r
-        step = jnp.where(definite, lu.substitute(factors, r), elastic)
-        return Evaluation(step, norm(K @ step, step), norm(r, elastic), definite)
+        definite, relaxed = jnp.all(lu.diagonal(factors) > 0), lu.substitute(elastic, r)
+        step = jnp.where(definite, lu.substitute(factors, r), relaxed)
+        return Evaluation(step, norm(K @ step, step), norm(r, relaxed), definite)
 
     floor = jnp.max(rounding_floor(projection.sections.stiffness, tau)) * K.shape[0] ** 0.5
     q, definite, steps = newton(evaluate, jnp.zeros(K.shape[0], K.dtype), floor)
     left = imbalance(q)
-    return q, norm(left, compliance @ left) <= 16 * floor, definite, steps
+    return q, norm(left, lu.substitute(elastic, left)) <= 16 * floor, definite, steps
 
 
 @partial(solve_projected.defjvp, symbolic_zeros=True)

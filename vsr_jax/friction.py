@@ -1,10 +1,13 @@
 r"""Friction of tendons: the capstan equation $\tau' = \mp \mu \varphi' \tau$ with the rate at which the tendon's path turns.
 
+Where the strain jumps, as where another tendon ends or a force acts, or where the routing has a corner, the path has a kink of angle
+$\Delta\varphi$, over which the tension falls by the factor $e^{\mp \mu \Delta\varphi}$ as on a drum.
+
 The unit tangent of the path in the world frame is $R t$, so $\varphi' = |t' + k \times t|$. The change of the strain along the arm
 that it needs is that of the balance itself, $H \xi' = \Lambda' - \partial r / \partial X + B_\tau \tau'$: no differences are taken.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,38 +16,72 @@ from jaxtyping import Array
 from . import component as c
 from .balance import actuation_wrench, chosen, chosen_rows, residual, spread, tangent, with_locked
 from .component import Vector
-from .quadrature import Grid, beyond, locate, within
+from .quadrature import Grid, beyond, interpolation, locate, weighted, within
 from .routing import thread_tangent
 from .scene import CrossSections
 
 
 class Rubbing(NamedTuple):
-    r"""Friction of the tendons that have it: $\pm\mu$ of each (positive for pull), and how the cross-sections change along the
-    arm, $\partial / \partial X$ at the nodes."""
+    r"""Friction of the tendons that have it: $\pm\mu$ of each (positive for pull), how the cross-sections change along the
+    arm, $\partial / \partial X$ at the nodes, and 1 for each step that starts at a breakpoint, where paths may have kinks (None if
+    the arm has no breakpoints)."""
 
     coefficients: Vector
     sections_rate: CrossSections
+    breaks: Array | None
 
 
-def decay(turning: Array, coefficient: Array, grid: Grid) -> Array:
-    r"""Share of the tension left at the nodes, $e^{-\mu \varphi(X)}$, from the rates $\varphi'$ there."""
-    whole = jnp.sum(grid.weight * turning, axis=(0, 1))
-    return jnp.exp(-coefficient * (whole - beyond((turning,), grid)[0]))
+def decay(turning: Array, kinks: Array | None, coefficient: Array, grid: Grid) -> Array:
+    r"""Share of the tension left at the nodes, $e^{-\mu \varphi(X)}$, from the rates $\varphi'$ there and the kinks before each step."""
+    angle = jnp.sum(grid.weight * turning, axis=(0, 1)) - beyond((turning,), grid)[0]
+    return jnp.exp(-coefficient * (angle if kinks is None else angle + jnp.cumsum(kinks, axis=0)))
 
 
-def rubbed(reach: Array | None, turning: Array, coefficient: Array, grid: Grid) -> Array:
-    """Share of a thread's force at the nodes, from where it reaches (None for everywhere) and how it turns there."""
+def rubbed(reach: Array | None, turning: Array, kinks: Array | None, coefficient: Array, grid: Grid) -> Array:
+    """Share of a thread's force at the nodes, from where it reaches (None for everywhere), how it turns there and its kinks."""
     if reach is None:
-        return decay(turning, coefficient, grid)
-    return reach * decay(reach * turning, coefficient, grid)
+        return decay(turning, kinks, coefficient, grid)
+    return reach * decay(reach * turning, kinks, coefficient, grid)
 
 
-def decay_at(turning: Array, coefficient: Array, grid: Grid, X: Array) -> Array:
+def decay_at(turning: Array, kinks: Array | None, coefficient: Array, grid: Grid, X: Array) -> Array:
     """`decay` at abscissas X."""
     step, sigma = locate(grid, X)
     through = jnp.cumsum(jnp.sum(grid.weight * turning, axis=0))
     before = jnp.append(jnp.zeros_like(through[:1]), through[:-1])
+    if kinks is not None:
+        before = before + jnp.cumsum(kinks)
     return jnp.exp(-coefficient * (before[step] + within(turning, grid, step, sigma)))
+
+
+def breaks_of(breakpoints: tuple[Array, ...], grid: Grid) -> Array | None:
+    """1 for each step of a grid that starts at a breakpoint, 0 for the others; None without breakpoints."""
+    if not breakpoints:
+        return None
+    return jnp.any(grid.start[:, None] == jnp.stack(breakpoints), axis=1).astype(grid.h.dtype)
+
+
+def kinks_of(xi: Vector, sections: CrossSections, breaks: Array | None, place: int, grid: Grid) -> Array | None:
+    r"""Angles $\Delta\varphi$ [rad] of a thread's path at the start of each step, between its tangents on both sides.
+
+    The tangents are those of the polynomials through the nodes of both steps, so that the angle has their order. Both are seen from
+    the same section: rotations do not jump. A thread's own ends are no kinks.
+    """
+    if breaks is None:
+        return None
+    at_start, at_end = interpolation(grid.X.shape[0])[0], interpolation(grid.X.shape[0]).sum(axis=0)
+    t_c = jnp.broadcast_arrays(*thread_tangent(xi, sections.paths[place]))
+    before = tuple(weighted(at_end, x)[:-1] for x in t_c)
+    after = tuple(weighted(at_start, x)[1:] for x in t_c)
+    inside, reach = breaks[1:], sections.reach[place]
+    if reach is not None:
+        inside = inside * reach[-1, :-1] * reach[0, 1:]
+    bend = c.cross(before, after)
+    square = c.dot(bend, bend)
+    kinked = (inside > 0) & (square > 0)
+    sine = jnp.sqrt(jnp.where(kinked, square, 1.0))
+    angle = jnp.where(kinked, jnp.arctan2(sine, c.dot(before, after)), 0.0)
+    return jnp.concatenate([jnp.zeros_like(angle[:1]), angle])
 
 
 def strain_rate(
@@ -58,7 +95,7 @@ def strain_rate(
     def imbalance(sections: CrossSections) -> Vector:
         return residual(xi, sections, tau)
 
-    change = jax.jvp(imbalance, (sections,), (rate,))[1]
+    change = jax.jvp(imbalance, *_alike((sections,), (rate,)))[1]
     right = c.subtract(actuation_wrench(xi, sections, tau_rate), change)
     right = right if reaction_rate is None else c.add(right, reaction_rate)
     factor = c.cholesky(chosen_rows(tangent(xi, sections, tau), free))
@@ -66,10 +103,16 @@ def strain_rate(
     return with_locked(answer, rate.rest, free)
 
 
+def _alike(values: tuple, rates: tuple) -> tuple[Any, Any]:
+    """Values and their rates in one shape: of arms side by side either may be the same for all."""
+    leaves, tree = jax.tree.flatten(values)
+    pairs = [jnp.broadcast_arrays(x, dx) for x, dx in zip(leaves, jax.tree.leaves(rates), strict=True)]
+    return tuple(jax.tree.unflatten(tree, list(side)) for side in zip(*pairs, strict=True))
+
+
 def turning_rate(xi: Vector, xi_rate: Vector, sections: CrossSections, rate: CrossSections, place: int) -> Array:
     r"""Rate at which a thread's path turns, $\varphi' = |t' + k \times t|$ [rad/m]."""
-    path, path_rate = sections.paths[place], rate.paths[place]
-    t_c, t_c_rate = jax.jvp(thread_tangent, (xi, path), (xi_rate, path_rate))
+    t_c, t_c_rate = jax.jvp(thread_tangent, *_alike((xi, sections.paths[place]), (xi_rate, rate.paths[place])))
     length = jnp.sqrt(c.dot(t_c, t_c))
     t = tuple(x / length for x in t_c)
     along = c.dot(t, t_c_rate)

@@ -1,19 +1,18 @@
 r"""Small dense systems, $A = L U$ without pivots, in plain array operations.
 
-For matrices whose leading minors are positive, as those of a stable arm are, no pivots are needed, and the pivots tell whether they
-are. Many systems may be solved side by side, and several such solves may stand in one program: LAPACK's batched routines wait for
-each other there until nothing moves (jaxlib 0.10.2, two cores).
+For matrices whose leading minors are positive, as those of a stable arm are, no pivots are needed, and the diagonal of U tells
+whether they are. Many systems may lie side by side in the last axes, and several such solves may stand in one program: LAPACK's
+batched routines block each other there (jaxlib 0.10.2, two cores).
 """
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
 
-def factor(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Factors of a matrix in one: U on and above the diagonal, L below it without its ones. The diagonal holds the pivots."""
-    place = jnp.arange(matrix.shape[0])
+def factor(matrix: Float[Array, "n n *arms"]) -> Float[Array, "n n *arms"]:
+    """Factors of a matrix in one: U on and above the diagonal, L below it without its ones."""
+    place = jnp.arange(matrix.shape[0]).reshape(-1, *(1,) * (matrix.ndim - 2))
 
     def eliminate(k: Array, A: Array) -> Array:
         row, below = A[k], place > k
@@ -21,13 +20,18 @@ def factor(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
         A = A - ratio[:, None] * jnp.where(below, row, 0.0)
         return A.at[:, k].set(jnp.where(below, ratio, A[:, k]))
 
-    return lax.fori_loop(0, place.size, eliminate, matrix)
+    return lax.fori_loop(0, matrix.shape[0], eliminate, matrix)
 
 
-def substitute(factors: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array, " n"]:
+def diagonal(factors: Float[Array, "n n *arms"]) -> Float[Array, "n *arms"]:
+    """Diagonal of U: all positive if and only if all leading minors of the matrix are."""
+    return jnp.diagonal(factors, axis1=0, axis2=1).transpose(factors.ndim - 2, *range(factors.ndim - 2))
+
+
+def substitute(factors: Float[Array, "n n *arms"], right: Float[Array, "n *arms"]) -> Float[Array, "n *arms"]:
     """Solution of $L U x = b$."""
-    size = right.size
-    place = jnp.arange(size)
+    size = right.shape[0]
+    place = jnp.arange(size).reshape(-1, *(1,) * (right.ndim - 1))
 
     def forward(k: Array, b: Array) -> Array:
         return b - jnp.where(place > k, factors[:, k], 0.0) * b[k]
@@ -40,18 +44,13 @@ def substitute(factors: Float[Array, "n n"], right: Float[Array, " n"]) -> Float
     return lax.fori_loop(0, size, backward, lax.fori_loop(0, size, forward, right))
 
 
-def inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Inverse of a matrix."""
-    factors = factor(matrix)
-    return jax.vmap(lambda b: substitute(factors, b), out_axes=1)(jnp.eye(matrix.shape[0], dtype=matrix.dtype))
-
-
-def solve(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array, " n"]:
+def solve(matrix: Float[Array, "n n *arms"], right: Float[Array, "n *arms"]) -> Float[Array, "n *arms"]:
     """Solution of $A x = b$, with derivatives of any order in both modes."""
 
-    def direct(A: Array, b: Array) -> Array:
-        return substitute(factor(A), b)
+    def product(x: Array) -> Array:
+        return jnp.sum(matrix * x, axis=1)
 
-    return lax.custom_linear_solve(
-        lambda x: matrix @ x, right, lambda _, b: direct(matrix, b), transpose_solve=lambda _, b: direct(matrix.T, b)
-    )
+    def transposed(_: object, b: Array) -> Array:
+        return substitute(factor(matrix.swapaxes(0, 1)), b)
+
+    return lax.custom_linear_solve(product, right, lambda _, b: substitute(factor(matrix), b), transposed)

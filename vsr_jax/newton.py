@@ -14,6 +14,8 @@ MAX_STEPS = 50
 MAX_DAMPED_STEPS = 200
 MAX_PLAIN_STEPS = 25
 LOAD_SHARES = 5
+MOST_TURN = 1.5
+"""Bound on how far [rad] one step of a loaded solve may turn the arm: one that coils it may lower the residual, and lead nowhere."""
 _LEAST_FRACTION = 1e-6
 _FAST = 1e-4
 _LEAST_DAMPING, _MOST_DAMPING = 0.1, 1e8
@@ -151,7 +153,16 @@ def damped_newton(
         new = new._replace(step=jax.tree.map(lambda s, last: s + more.astype(s.dtype) * last, new.step, step))
         stalled = whole & (new.merit > 0.5 * old.merit)
         there = _Guard(
-            new.size, new.merit, new.definite, work(new.residual, new.step), damping, given, new.definite | plain, stalled, old.spent, old.plain
+            new.size,
+            new.merit,
+            new.definite,
+            work(new.residual, new.step),
+            damping,
+            given,
+            new.definite | plain,
+            stalled,
+            old.spent,
+            old.plain,
         )
         here = old._replace(damping=damping, fresh=plain)
         guard = _where(taken, there, here)._replace(spent=old.spent + 1, plain=old.plain + plain)

@@ -149,6 +149,38 @@ def react(xi: Vector, grid: Grid, loads: Loading) -> Reaction:
     return Reaction(starts, R, (*m, *n), density, wrench, axis, points, follower, body_density)
 
 
+def reaction_change(change: Vector, along: Reaction, grid: Grid, loads: Loading) -> Vector:
+    r"""Change $\delta\Lambda$ of the reaction with a small change $(\kappa, \upsilon)$ of the strain, of the order of the nodes' quadrature.
+
+    With the rotation $\theta(X) = \int_0^X R \kappa \, ds$ of the sections in the world frame
+
+    $$\delta n = \int_X^L \theta \times f \, ds, \quad
+    \delta m = \int_X^L ((\theta \times p' + R \upsilon) \times n + p' \times \delta n + \theta \times c) \, ds, \quad
+    \delta\Lambda = R^T (\delta m - \theta \times m, \delta n - \theta \times n),$$
+
+    where c and f are the loads that follow; those at points add $\theta \times F$ before them. All arrays broadcast: many changes
+    may stand in an axis behind the nodes, where the other arguments have an axis of size 1.
+    """
+    R, m, n = along.rotation, along.world[:3], along.world[3:]
+    bend, whole = c.matvec(R, change[:3]), grid.weight
+    later = beyond(bend, grid)
+    theta = c.subtract(tuple(jnp.sum(whole * x, axis=(0, 1)) for x in bend), later)
+    zero = (jnp.zeros_like(theta[0]),) * 3
+    dm, dn = zero, zero
+    for point, wrench in zip(loads.follower_points, along.points, strict=True):
+        turn = tuple(jnp.sum(whole * point.before * x, axis=(0, 1)) for x in bend)
+        dm = c.add(dm, c.scale(point.before, c.cross(turn, wrench[:3])))
+        dn = c.add(dn, c.scale(point.before, c.cross(turn, wrench[3:])))
+    if along.follower is not None:
+        more = beyond((*c.cross(theta, along.follower[:3]), *c.cross(theta, along.follower[3:])), grid)
+        dm, dn = c.add(dm, more[:3]), c.add(dn, more[3:])
+    moved = c.cross(c.add(c.cross(theta, along.axis), c.matvec(R, change[3:])), n)
+    if loads.follows:
+        moved = c.add(moved, c.cross(along.axis, dn))
+    dm = c.add(dm, beyond(moved, grid))
+    return turned(c.transpose(R), (*c.subtract(dm, c.cross(theta, m)), *c.subtract(dn, c.cross(theta, n))))
+
+
 def react_at(xi: Vector, grid: Grid, loads: Loading, X: Array) -> Vector:
     r"""Reaction $\Lambda$ at abscissas X, six component arrays of their shape, from the strain at the nodes."""
     along = react(xi, grid, loads)

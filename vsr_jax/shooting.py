@@ -31,9 +31,10 @@ _INSIDE = 1e-10  # of a segment: what is evaluated at its ends belongs to it
 
 
 class Guess(NamedTuple):
-    """A solution on steps: its grid, the thread forces at their start and the turning rates of tendons with friction."""
+    """A solution on steps: its grid, strain there, the thread forces at their start and the turning rates of tendons with friction."""
 
     grid: Grid
+    xi: Vector
     forces: Vector
     turning: Vector
 
@@ -80,7 +81,7 @@ def integrate(
 
     def at(t: Array) -> tuple[Array, CrossSections, Vector]:
         x = start + h * (_INSIDE + (1 - 2 * _INSIDE) * t)
-        shares = shares_at(scene, guess.turning, guess.grid, x)
+        shares = shares_at(scene, guess.xi, guess.turning, guess.grid, x)
         return x, scene.sections(x), shared(guess.forces, shares)
 
     def field(t: Any, line: Line, _: None) -> Line:
@@ -129,7 +130,7 @@ def shoot(scene: Scene, guess: Guess, first: Unknown, segments: Grid, control: C
         """Strain's reaction and rotation at the end, as one array."""
         line, done, steps = integrate(scene, guess, control, start, h, rotation, reaction, jnp.ones_like(h))
         x = start + h * (1 - _INSIDE)
-        tau = shared(guess.forces, shares_at(scene, guess.turning, guess.grid, x))
+        tau = shared(guess.forces, shares_at(scene, guess.xi, guess.turning, guess.grid, x))
         wrench = c.join(residual(c.split(line.xi), scene.sections(x), tau))
         return jnp.concatenate([wrench, (rotation @ line.g[:3, :3]).reshape(-1)]), (line.g, done, steps)
 

@@ -64,7 +64,7 @@ class StrainDependent(SteppedModel):
 
     def nodes(self, scene: Scene, forces: Vector, state: Unknown) -> Nodes:
         grid = self.grid(scene)
-        return Nodes(grid, state.xi, scene.sections(grid.X), shares_at(scene, state.turning, grid, grid.X))
+        return Nodes(grid, state.xi, scene.sections(grid.X), shares_at(scene, state.xi, state.turning, grid, grid.X))
 
     def coordinates(self, scene: Scene, forces: Vector, state: Unknown) -> Float[Array, " dofs"]:
         return jnp.array(forces, state.xi[0].dtype)
@@ -73,7 +73,7 @@ class StrainDependent(SteppedModel):
         grid = self.grid(scene)
         loads = loading(scene, grid)
         reaction = None if loads is None else react_at(state.xi, grid, loads, X)
-        tau = shared(forces, shares_at(scene, state.turning, grid, X))
+        tau = shared(forces, shares_at(scene, state.xi, state.turning, grid, X))
         start = tuple(jnp.interp(X, grid.X.T.reshape(-1), x.T.reshape(-1)) for x in state.xi)
         return solve_balance(scene.sections(X), tau, reaction, scene.free, start).xi
 
