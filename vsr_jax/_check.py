@@ -37,7 +37,7 @@ def numbers(
         raise _refuse(name, value, needed) from None
     if jnp.issubdtype(array.dtype, jnp.complexfloating) or array.dtype == bool:
         raise _refuse(name, value, needed)
-    array = array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(float)
+    array = precise(name, array) if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(float)
     if shape is not None and array.shape != shape:
         raise ValueError(f"{name}: got shape {array.shape}, need {needed}")
     known = concrete(array)
@@ -45,6 +45,13 @@ def numbers(
         return array
     if (finite and not np.all(np.isfinite(known))) or (positive and not np.all(known > 0)) or np.any(known < least):
         raise _refuse(name, value, needed)
+    return array
+
+
+def precise(name: str, array: Array) -> Array:
+    """`array` if it is in single or double precision, in which alone equilibria can be found."""
+    if array.dtype not in (jnp.float32, jnp.float64):
+        raise ValueError(f"{name}: got {array.dtype}, need float32 or float64")
     return array
 
 

@@ -36,7 +36,7 @@ class Cable(NamedTuple):
         """Stretch per unit of the tension at the start [m/N]; `share` of it is left further on."""
         if self.compliance is None:
             return jnp.zeros_like(self.length)
-        mean = 1.0 if share is None else jnp.sum(grid.weight * share, axis=(0, 1)) / jnp.sum(grid.weight * (share > 0), axis=(0, 1))
+        mean = 1.0 if share is None else jnp.sum(grid.weight * share, axis=(0, 1)) / jnp.sum(jnp.where(share > 0, grid.weight, 0.0), axis=(0, 1))
         return self.length * self.compliance * mean
 
 

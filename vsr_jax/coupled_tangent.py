@@ -9,6 +9,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from . import component as c, lu
+from ._types import cast
 from .balance import chosen, spread, tangent, thread_direction, thread_wrench
 from .component import Vector
 from .coupled import Imbalance, Kind, Problem, State, Unknown, state_of
@@ -91,7 +92,7 @@ def tangent_solve(imbalance: Callable, unknown: Unknown, problem: Problem, right
 
     def nearly(b: Imbalance) -> Imbalance:
         step, _ = approximate_solve(unknown, at, b, problem, kind)
-        step = jax.tree.map(lambda x: x.astype(problem.grid.h.dtype), step)
+        step = cast(step, problem.grid.h.dtype)
         return Imbalance(chosen(step.xi, kind.free), step.tension, step.turning)
 
     def scaled_apply(x: Array) -> Array:

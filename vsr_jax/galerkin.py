@@ -169,7 +169,7 @@ def _sizes_of(basis: Basis, K: Array, problem: Problem, kind: Kind) -> _Sizes:
     gram = [w * jnp.einsum("ija...,ijb...,ij...->ab...", m, m, grid.weight / length) for m, w in _by_strain(basis.matrix, length)]
     pulls = [jnp.max(pull_of(sections, place, length), axis=(0, 1)) for place in kind.cables]
     axial = jnp.max(sections.stiffness[3], axis=(0, 1))
-    return _Sizes(sum(gram[1:], gram[0]), lu.factor(K), jnp.stack(pulls) if pulls else jnp.zeros((0, *length.shape)), axial)
+    return _Sizes(sum(gram[1:], gram[0]), lu.factor(K), jnp.stack(pulls) if pulls else jnp.zeros((0, *length.shape), K.dtype), axial)
 
 
 def _by_strain(matrix: Array, length: Array) -> list[tuple[Array, Array | float]]:

@@ -64,10 +64,10 @@ def _share(edges: Float[Array, " edges"], steps: int | Array, place: Array) -> t
     whole = jnp.floor(exact)
     order = jnp.argsort(jnp.argsort(whole - exact))
     spare = steps - lengths.size - jnp.sum(whole).astype(int)
-    count = 1 + whole.astype(int) + (order < spare)
+    count = 1 + whole.astype(int) + (order < spare).astype(int)
     last = jnp.cumsum(count)
     piece = jnp.minimum(jnp.searchsorted(last, place, side="right"), lengths.size - 1)
-    return piece, count[piece], place - (last - count)[piece]
+    return piece, count[piece].astype(edges.dtype), place - (last - count)[piece]
 
 
 def interpolation(stages: int) -> np.ndarray:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ._check import concrete, instance, is_traced, numbers
+from ._check import concrete, instance, is_traced, numbers, precise
 from ._types import Scalar, cast
 from .actuator import Actuator, Tendon
 from .component import Vector, add, dot
@@ -185,7 +185,8 @@ class Scene(eqx.Module):
         return _rest_length(self, place)
 
     def astype(self, dtype: Any) -> "Scene":
-        """The same scene with its floating-point numbers in `dtype`."""
+        """The same scene with its floating-point numbers in `dtype`, float32 or float64."""
+        precise("dtype", jnp.zeros((), dtype))
         return cast(self, dtype)
 
     def to_toml(self, inputs: Any = None, title: str = "") -> str:
