@@ -1,6 +1,7 @@
 """Inverse statics: targets that were reached by known inputs, and some that cannot be reached."""
 
 import json
+import re
 
 import jax
 import jax.numpy as jnp
@@ -163,3 +164,15 @@ def test_the_command(tmp_path, capsys, monkeypatch, scene, close):
     assert f"  miss       {verdict} 0.001 m allowed\n" in text
     saved = json.loads(out.read_text())
     assert (saved["reached"], saved["allowed_miss"]) == (close, 1e-3)
+
+
+@pytest.mark.slow
+def test_the_command_reaches_the_six_digits_that_it_printed(tmp_path, capsys, scene):
+    """Two tendons for a tip in space: no inputs meet rounded digits exactly."""
+    file = tmp_path / "arm.toml"
+    file.write_text(vsr.Scene(scene.rod, scene.actuators[:2]).to_toml([7.0, 2.0]))
+    assert cli.main(["solve", str(file), "--steps", "8"]) == cli_common.DONE
+    digits = re.search(r"  tip        \((.*), (.*), (.*)\) m", capsys.readouterr().out).groups()
+    arguments = ["reach", str(file), "--target", *digits, "--high", "12", "--steps", "8"]
+    assert cli.main(arguments) == cli_common.DONE
+    assert re.search(r"  miss       \S+ m, within the 7.5e-05 m allowed\n", capsys.readouterr().out)
