@@ -117,6 +117,33 @@ def test_a_scene_may_be_built_under_jit():
     np.testing.assert_allclose(tip(0.005), vsr.solve(paper.scene("B1"), [-15.0]).tip[:3, 3], atol=1e-13)
 
 
+@pytest.mark.parametrize(
+    "quantity", [*(pytest.param(name, marks=pytest.mark.slow) for name in ("position", "reaction")), "strain", "thread"]
+)
+def test_traced_places_beyond_the_arm_are_nan_and_harm_no_others(quantity):
+    arm = vsr.Rod(0.5, vsr.Circular(lambda x: 0.01 + 0.002 * jnp.sqrt(0.5 - x)), vsr.Material(1e6, poisson=0.5))  # NaN beyond the arm
+    scene = vsr.Scene(arm, [vsr.Tendon(vsr.Parallel(0.005, 0.0), end=0.3)], [vsr.TipWrench(force=(0.0, 0.1, 0.0))])
+    eq = vsr.solve(scene, jnp.array([1.0]), model=vsr.StrainDependent(8))
+
+    def at(X):
+        return eq.thread(0, X) if quantity == "thread" else getattr(eq, quantity)(X)
+
+    @jax.jit
+    def found_and_slope(X):
+        return at(X), jax.grad(lambda X: jnp.nansum(at(X)))(X)
+
+    on, off = jnp.array([0, 1, 3]), jnp.array([2, 4])
+    X = jnp.array([0.0, 0.2, 0.7, 0.3, -0.1])
+    found, slope = found_and_slope(X)
+    wanted, wanted_slope = found_and_slope(X.at[off].set(0.1))
+    assert np.all(np.isnan(found[off]))
+    np.testing.assert_array_equal(found[on], wanted[on])
+    np.testing.assert_array_equal(slope[off], 0)
+    np.testing.assert_array_equal(slope[on], wanted_slope[on])
+    assert np.all(np.isfinite(wanted[on]))
+    assert np.all(np.isfinite(slope))
+
+
 @pytest.mark.slow
 def test_gradients_in_single_precision(helix):
     def height(scene, tau):

@@ -116,6 +116,14 @@ def locate(grid: Grid, X: Array) -> tuple[Array, Array]:
     return step, jnp.where(h > 0, (X - grid.start[step]) / jnp.where(h > 0, h, 1.0), 0.0)
 
 
+def onto(X: Array, start: Array | float, end: Array | float, slack: Array) -> tuple[Array, Array]:
+    """Abscissas clipped to [start, end], and whether they lie there or beyond it by `slack` at most. Those farther away become `start`,
+    so that what is computed from them is finite; the derivative of the others is 1."""
+    near = (X - start >= -slack) & (X - end <= slack)
+    x = jnp.where(near, X, start)
+    return x + lax.stop_gradient(jnp.clip(x, start, end) - x), near
+
+
 def within(density: Array, grid: Grid, step: Array, sigma: Array | float) -> Array:
     r"""Integral from the start of a step to the fraction $\sigma$ of it of the polynomial through the values at its nodes."""
     stages = grid.X.shape[0]
