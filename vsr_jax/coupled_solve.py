@@ -82,7 +82,9 @@ def _start(problem: Problem, kind: Kind) -> Unknown:
     tau = problem.sections.carry(with_tensions(problem.forces, tension, kind))
     alone = solve_balance(*c.single((problem.sections, tau)), None, kind.free)
     sound = alone.balanced & alone.definite
-    xi = tuple(jnp.where(sound, x.astype(rest.dtype), rest) for x, rest in zip(alone.xi, problem.sections.rest, strict=True))
+    rest = problem.sections.rest
+    xi = tuple(jnp.where(sound, x.astype(x0.dtype), x0) for x, x0 in zip(alone.xi, rest, strict=True))
+    xi = with_locked(xi, rest, kind.free)  # these are never corrected
     return Unknown(xi, tension, (jnp.zeros_like(xi[0]),) * len(kind.rubbing))
 
 
