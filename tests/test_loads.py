@@ -79,13 +79,11 @@ def test_a_prescribed_basis_takes_few_steps_under_gravity():
 
     def one(tension):
         eq = vsr.solve(HEAVY, tension, model=BENDING)
-        return eq.status, eq.steps, eq.tip[:3, 3]
+        return eq.status, eq.steps
 
-    status, steps, tips = jax.jit(jax.vmap(one))(jnp.linspace(0.0, 5.0, 21)[:, None])
+    status, steps = jax.jit(jax.vmap(one))(jnp.linspace(0.0, 5.0, 21)[:, None])
     assert np.all(status == vsr.Status.CONVERGED)
     assert np.max(steps) <= 15
-    exact = vsr.solve(HEAVY, [5.0], model=vsr.StrainDependent(16), throw=True).tip[:3, 3]
-    np.testing.assert_allclose(tips[-1], exact, atol=0.01)  # eight coordinates
 
 
 @pytest.mark.slow
