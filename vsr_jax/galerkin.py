@@ -203,7 +203,8 @@ def _solve(kind: Kind, basis: Basis, problem: Problem) -> Solution:
         step = Unknown(flat[:size].astype(K.dtype), flat[size:].astype(K.dtype))
         moved = sizes.of_step(step)
         cut = MOST_TURN / jnp.maximum(turn, MOST_TURN)
-        definite = jnp.all(lu.diagonal(factors)[:size] > 0, axis=0)
+        falling = lu.diagonal(factors) <= 0  # taut cables hold as many motions as their own rows have such pivots
+        definite = jnp.sum(falling[:size], axis=0) == jnp.sum(falling[size:], axis=0)
         return Damped(jax.tree.map(lambda x: cut * x, step), moved, r.q, sizes.of_imbalance(r), definite)
 
     def work(force: Array, step: Unknown) -> Array:
