@@ -117,7 +117,7 @@ def damped_newton(
     the residual no longer falls by half: rounding. Nothing that would be refused ends the loop before its bounds do. A problem
     that meets the bound on its evaluations or on $\mu$ gets some plain Newton steps from where it is: these end in an
     equilibrium that is not stable where there is one nearby. The last step is never taken, so that the residual returned is that
-    of the point returned. Problems may stand side by side, in the last axes of all arrays: each goes its own way and stands
+    of the point returned. Problems may be solved together, in the last axes of all arrays: each takes its own steps and stands
     still when it is done.
 
     **Arguments:**
@@ -148,8 +148,7 @@ def damped_newton(
         taken = ~old.fresh | (jnp.isfinite(new.merit) & better)
         damping = jnp.where(taken & (new.definite | plain), damping, _raised(jnp.where(taken, damping, old.damping)))
         whole = (old.damping == 0) & (damping == 0) & old.fresh & (old.given == shares)
-        more = _extrapolated(jnp.minimum(left / old.pull, new.size / old.size))
-        more = jnp.where(whole & (new.merit > 4 * floor), more, 0.0)
+        more = _extrapolated(whole & (new.merit > 4 * floor), jnp.minimum(left / old.pull, new.size / old.size))
         new = new._replace(step=jax.tree.map(lambda s, last: s + more.astype(s.dtype) * last, new.step, step))
         stalled = whole & (new.merit > 0.5 * old.merit)
         there = _Guard(
@@ -170,10 +169,9 @@ def damped_newton(
         go = pending(old)
         return _where(go & taken, trial, x), new.step, _where(go, guard, old)
 
-    zero, no = jnp.zeros_like(floor), jnp.zeros(floor.shape, bool)
+    zero, no, none = jnp.zeros_like(floor), jnp.zeros(floor.shape, bool), jnp.zeros(floor.shape, jnp.int32)
     damping = jnp.full_like(floor, _LEAST_DAMPING if shares == 1 else 0.0)
-    count = jnp.zeros(floor.shape, jnp.int32)
-    guard = _Guard(zero, zero + jnp.inf, ~no, zero, damping, zero + 1, no, no, count, count)
+    guard = _Guard(zero, zero + jnp.inf, ~no, zero, damping, zero + 1, no, no, none, none)
     step = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(evaluate, start, floor, floor).step)
     x, _, guard = lax.while_loop(lambda state: jnp.any(pending(state[2])), advance, (start, step, guard))
     return Solution(x, guard.merit <= accepted, guard.definite, guard.spent)
@@ -196,10 +194,10 @@ class _Guard(NamedTuple):
     plain: Array
 
 
-def _extrapolated(left: Array) -> Array:
-    """How much of the last step to take again, from the share of the residual that it left along itself."""
+def _extrapolated(wanted: Array, left: Array) -> Array:
+    """How much of the last step to take again where wanted, from the share of the residual that it left along itself."""
     share = jnp.clip(left, 0.0, _MOST_LEFT)
-    return jnp.where(share > _LEAST_LEFT, share**2 / (1 - share), 0.0)
+    return jnp.where(wanted & (share > _LEAST_LEFT), share**2 / (1 - share), 0.0)
 
 
 def _raised(damping: Array) -> Array:
