@@ -41,7 +41,7 @@ def run(scene: vsr.Scene, number: int, rounds: int) -> dict[str, Any]:
     tips = jax.vmap(lambda u: vsr.solve(scene, u, model=MODEL).tip[:3, 3])(inputs)
 
     def reach(target: jax.Array) -> vsr.Reach:
-        return vsr.reach(scene, target, (0.0, MOST), model=MODEL, tolerance=MISS)
+        return vsr.reach(scene, target, (0.0, MOST), model=MODEL, allowed_miss=MISS)
 
     job = Timed(lambda targets: jax.lax.map(reach, targets, batch_size=BATCH), tips)
     take_turns([job], rounds)

@@ -80,6 +80,44 @@ def test_friction_along_an_arc_is_the_closed_form():
         np.testing.assert_allclose(np.abs(eq.strain(X)[:, 2]) * EI / d, want, rtol=1e-7)
 
 
+class Corner(vsr.routing.Routing):
+    """Two straight lines of opposite slope."""
+
+    slope: jax.Array
+    place: jax.Array
+
+    def __init__(self, slope, place):
+        self.slope, self.place = jnp.asarray(slope), jnp.asarray(place)
+
+    def __call__(self, X):
+        return self.slope * (self.place - jnp.abs(X - self.place)), jnp.zeros_like(X)
+
+    @property
+    def breakpoints(self):
+        return (self.place,)
+
+
+def test_a_corner_of_the_path_holds_tension_back():
+    r"""Over a corner of angle $\Delta$ a tendon keeps $e^{-\mu \Delta}$ of its tension, or the inverse when it is let go."""
+    modulus, angle = 1e13, 2 * np.arctan(0.05)
+    rod = vsr.Rod(0.3, vsr.Circular(0.02), vsr.Material(modulus, poisson=0.3))
+    for motion, factor in (("pull", np.exp(-0.3 * angle)), ("release", np.exp(0.3 * angle))):
+        tendon = vsr.Tendon(Corner(0.05, 0.1), friction=0.3, motion=motion)
+        eq = vsr.solve(vsr.Scene(rod, [tendon]), [2.0], model=STEPS, throw=True)
+        tension = (1 - np.asarray(eq.strain(jnp.array([0.05, 0.2]))[:, 3])) * modulus * np.pi * 0.02**2 / np.cos(angle / 2)
+        np.testing.assert_allclose(tension, [2.0, 2.0 * factor], rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_the_kink_where_another_tendon_ends_is_that_of_finer_steps():
+    helices = vsr.Tendon(vsr.Helix(0.007, pitch=0.3), friction=0.3), vsr.Tendon(vsr.Helix(0.007, pitch=0.15, phase=2.0), end=0.15)
+    kinked = vsr.Scene(ARM, helices, [vsr.Gravity()])
+    coarse, fine = (vsr.solve(kinked, [4.0, 8.0], model=vsr.StrainDependent(steps), throw=True).tip[:3, 3] for steps in (16, 64))
+    shot = vsr.solve(kinked, [4.0, 8.0], model=vsr.Continuum(derivative=vsr.StrainDependent(64)), throw=True).tip[:3, 3]
+    np.testing.assert_allclose(coarse, fine, atol=2e-6)
+    np.testing.assert_allclose(shot, fine, atol=2e-8)
+
+
 @pytest.mark.slow
 def test_friction_agrees_between_the_models():
     rubbing = scene([vsr.Gravity()], friction=0.2)

@@ -61,6 +61,7 @@ TABLE = {
     "falls over and hangs through itself": Case(arm(weight=100.0, down=UP), 0.1, coarse=1e-3),
     "column below its weight's limit": Case(arm(weight=7.0, down=UP), 0.0, (1 - 3.5 * SHORT, 0.0, 0.0)),
     "column beyond its weight's limit": Case(arm(weight=8.5, down=UP), status=UNSTABLE),
+    "two radii and moduli beyond their weight's limit": Case(arm(weight=30.0, down=UP, jumps=0.5), status=UNSTABLE),
     "strut below Euler's load": Case(arm(dead=(-2.3, 0.0, 0.0)), 0.0, (1 - 2.3 * SHORT, 0.0, 0.0)),
     "strut beyond Euler's load": Case(arm(dead=(-2.7, 0.0, 0.0)), status=UNSTABLE),
     "strut beyond Euler's load, nudged": Case(arm(dead=(-2.7, 0.0, 0.0)), 0.05, coarse=1e-6),
@@ -215,3 +216,75 @@ def test_six_tendons_with_random_tip_wrenches_converge(draws):
     margin = np.asarray(jax.jit(jax.vmap(lambda eq: eq.stability))(eqs))
     assert np.all(np.isfinite(margin))
     assert np.all(margin > 0)
+
+
+RATIOS, SIZES = (10.0, 40.0, 80.0, 200.0, 400.0, 1000.0, 3000.0), (1.0, 3.0, 10.0, 30.0)
+"""Length by radius, and force by $EI / L^2$."""
+
+
+def tip_loads(directions):
+    """Radius [m] and tip force [N] of an arm of 0.4 m and 10 MPa for all ratios, sizes and directions."""
+    vectors = np.random.default_rng(0).normal(size=(directions, 3))
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    ratio, size, place = (x.reshape(-1) for x in np.meshgrid(RATIOS, SIZES, np.arange(directions), indexing="ij"))
+    radius = 0.4 / ratio
+    return radius, vectors[place] * (size * 1e7 * math.pi * radius**4 / 4 / 0.4**2)[:, None]
+
+
+def under_tip_loads(dtype, steps, directions):
+    """Status, tip [1/L] and evaluations of every arm."""
+
+    def one(radius, force):
+        rod = vsr.Rod(0.4, vsr.Circular(radius), vsr.Material(1e7, poisson=0.4))
+        eq = vsr.solve(vsr.Scene(rod, [], [vsr.TipWrench(force)]), jnp.zeros(0, dtype), model=vsr.StrainDependent(steps))
+        return eq.status, eq.tip[:3, 3] / 0.4, eq.steps
+
+    return [np.asarray(x) for x in jax.jit(jax.vmap(one))(*(jnp.asarray(x, dtype) for x in tip_loads(directions)))]
+
+
+def test_arms_of_every_slenderness_bear_a_tip_force():
+    """Thin arms were refused while their solve still converged. How many steps it takes does not depend on the slenderness."""
+    status, _, taken = under_tip_loads("float64", 16, 5)
+    assert np.all(status == vsr.Status.CONVERGED)
+    mean = np.mean(taken.reshape(len(RATIOS), -1), axis=1)
+    assert np.ptp(mean) < 0.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("steps", [16, 32])
+def test_arms_of_every_slenderness_bear_a_tip_force_in_a_hundred_directions(steps):
+    """In single precision too, where the tips of slender arms were wrong by up to a hundredth of the length."""
+    status, tips, _ = under_tip_loads("float64", steps, 100)
+    assert np.all(status == vsr.Status.CONVERGED)
+    rough_status, rough_tips, _ = under_tip_loads("float32", steps, 100)
+    converged = rough_status == vsr.Status.CONVERGED
+    assert np.mean(~converged) <= 0.01
+    assert np.max(np.linalg.norm(rough_tips - tips, axis=1)[converged]) < 5e-6
+
+
+def test_a_catheter_bears_a_tip_force_in_any_direction():
+    """Two of a hundred were refused: four tendons in a wire of 1 mm and 60 GPa, 0.5 N at its tip."""
+    random = np.random.default_rng(1)
+    forces = random.normal(size=(200, 3))
+    forces *= 0.5 / np.linalg.norm(forces, axis=1, keepdims=True)
+    rod = vsr.Rod(0.2, vsr.Circular(diameter=0.001), vsr.Material(60e9, poisson=0.3))
+    places = [(0.0004 * math.cos(angle), 0.0004 * math.sin(angle)) for angle in np.arange(4) * math.pi / 2]
+    threads = [vsr.Tendon(vsr.Parallel(*place)) for place in places]
+
+    def status(tensions, force):
+        return vsr.solve(vsr.Scene(rod, threads, [vsr.TipWrench(force)]), tensions, model=vsr.StrainDependent(16)).status
+
+    found = jax.jit(jax.vmap(status))(jnp.asarray(random.uniform(0, 3, (200, 4))), jnp.asarray(forces))
+    assert np.all(found == vsr.Status.CONVERGED)
+
+
+def test_a_tapered_arm_of_silicone_upright_under_its_weight_is_unstable():
+    """At exactly zero pressure nothing tips it over; the straight equilibrium is found, and is none that stays."""
+
+    def status(pressure):
+        rod = vsr.Rod(0.3, vsr.Circular(vsr.Taper(0.010, 0.004)), vsr.Material(1e5, poisson=0.45, density=1080.0))
+        scene = vsr.Scene(rod, [vsr.Chamber(vsr.Parallel(0.0, 0.003), area=1e-5)], [vsr.Gravity((-9.81, 0.0, 0.0))])
+        return vsr.solve(scene, pressure[None], model=MODEL).status
+
+    found = jax.jit(jax.vmap(status))(jnp.array([0.0, 100.0]))
+    assert list(found) == [UNSTABLE, vsr.Status.CONVERGED]

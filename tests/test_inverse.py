@@ -1,6 +1,7 @@
 """Inverse statics: targets that were reached by known inputs, and some that cannot be reached."""
 
 import json
+import re
 
 import jax
 import jax.numpy as jnp
@@ -23,17 +24,18 @@ def scene():
 
 @pytest.fixture(scope="module")
 def reached(scene):
-    """Inputs drawn, their tips with one more beyond reach, and what is found for these."""
+    """Inputs drawn, their tips with one more that is out of reach by 20 um and one by far, and what is found for these."""
     drawn = jnp.asarray(np.random.default_rng(3).uniform(0.2, MOST, (7, 3)))
     tips = jax.vmap(lambda u: vsr.solve(scene, u, model=MODEL).tip[:3, 3])(drawn)
-    targets = jnp.concatenate([tips, jnp.array([[2.0, 0.0, 0.0]])])
+    targets = jnp.concatenate([tips, jnp.array([[0.75 + 2e-5, 0.0, 0.0], [2.0, 0.0, 0.0]])])
     return drawn, targets, jax.vmap(lambda target: vsr.reach(scene, target, (0.0, MOST), model=MODEL))(targets)
 
 
 def test_all_that_can_be_reached_are_and_the_inputs_are_found_again(scene, reached):
     drawn, targets, found = reached
-    assert np.all(found.reached[:-1])
-    np.testing.assert_allclose(found.inputs[:-1], drawn, atol=1e-8)  # three tendons and three coordinates: there is one way only
+    assert np.all(found.reached[:7])
+    assert np.all(found.miss[:7] < 1e-9)
+    np.testing.assert_allclose(found.inputs[:7], drawn, atol=1e-8)  # three tendons and three coordinates: there is one way only
     alone = vsr.solve(scene, found.inputs[2], model=MODEL)
     np.testing.assert_allclose(alone.tip[:3, 3], targets[2], atol=1e-9)
 
@@ -44,6 +46,14 @@ def test_what_is_out_of_reach_gets_the_nearest_point_and_says_so(reached):
     assert float(found.miss[-1]) == pytest.approx(1.25, abs=1e-6)  # the straight arm, at rest
     np.testing.assert_array_equal(found.inputs[-1], 0)
     assert np.all(found.equilibrium.converged)
+
+
+def test_what_is_missed_by_less_than_is_allowed_is_reached(reached):
+    _, _, found = reached
+    np.testing.assert_allclose(found.miss[7], 2e-5, rtol=1e-6)
+    assert found.reached[7]
+    np.testing.assert_allclose(found.allowed_miss, 1e-4 * 0.75)
+    np.testing.assert_array_equal(found.inputs[7], 0)
 
 
 @pytest.mark.slow
@@ -91,7 +101,10 @@ def test_derivatives_by_the_target_are_those_of_differences(place):
         ([0.5, 0.1, 0.0], ([0.0, 0.0], 1.0), {}, r"bounds\[0\]: got shape \(2,\), need one number or 3"),
         ([0.5, 0.1, 0.0], (-1.0, 1.0), {}, r"inputs\[0\]: got -1, need a finite number >= 0"),
         ([0.5, 0.1, 0.0], (0.0, 1.0), {"X": [0.1, 0.2]}, r"X: got shape \(2,\) for targets of shape \(3,\)"),
-        ([0.5, 0.1, 0.0], (0.0, 1.0), {"tolerance": -1.0}, r"tolerance: got -1.0, need a finite number > 0"),
+        ([0.5, 0.1, 0.0], (0.0, 1.0), {"allowed_miss": -1.0}, r"allowed_miss: got -1.0, need a finite number > 0"),
+        ([[0.5, 0.1, 0.0]], (0.0, 1.0), {"X": [9.0]}, r"X: got 9 m, need 0 to 0.75 m, the ends of the arm"),
+        (np.diag([0.0, 0.0, 0.0, 1.0]), (0.0, 1.0), {}, r"target: got a rotation of zeros, need a rigid transform"),
+        (np.diag([1.0, 1.0, -1.0, 1.0]), (0.0, 1.0), {}, r"target: got a reflection"),
     ],
 )
 def test_refusals(unchecked, scene, target, bounds, options, message):
@@ -104,20 +117,62 @@ def test_no_actuators_are_refused(unchecked, scene):
         vsr.reach(vsr.Scene(scene.rod, []), [0.5, 0.0, 0.0], (0.0, 1.0))
 
 
+@pytest.mark.slow
+def test_six_digits_of_a_tip_are_reached_and_the_nearest_is_as_exact_as_ever(scene):
+    """One tendon, whose tips lie on a line in space: the target that was rounded is beside it."""
+    one = vsr.Scene(scene.rod, scene.actuators[:1])
+    tip = vsr.solve(one, [7.0], model=MODEL).tip[:3, 3]
+    rounded = jnp.asarray([float(f"{x:.6g}") for x in tip]) + jnp.array([0.0, 0.0, 2e-6])
+    found = vsr.reach(one, rounded, (0.0, MOST), model=MODEL)
+    assert bool(found.reached)
+    assert 1e-6 * 0.75 < found.miss < 1e-5
+    np.testing.assert_allclose(found.inputs, [7.0], atol=1e-4)
+    np.testing.assert_allclose(found.allowed_miss, 1e-4 * 0.75)
+    strict = vsr.reach(one, rounded, (0.0, MOST), model=MODEL, allowed_miss=1e-6)
+    assert not bool(strict.reached)
+    np.testing.assert_array_equal(strict.inputs, found.inputs)
+
+
+@pytest.mark.slow
+def test_points_beyond_the_arm_are_missed_where_they_are_traced(scene):
+    one = vsr.Scene(scene.rod, scene.actuators[:1])
+    target = vsr.solve(one, [7.0], model=MODEL).position([0.4])
+    found = jax.jit(jax.vmap(lambda X: vsr.reach(one, target, (0.0, MOST), X=X, model=MODEL)))(jnp.array([[0.4], [9.0]]))
+    np.testing.assert_array_equal(found.reached, [True, False])
+    np.testing.assert_allclose(found.inputs[0], [7.0], atol=1e-8)
+    assert np.isinf(found.miss[1])
+
+
 @pytest.mark.parametrize("close", [True, False])
 def test_the_command(tmp_path, capsys, monkeypatch, scene, close):
-    def reach(scene, target, bounds, model):
+    def reach(scene, target, bounds, model, allowed_miss):
         np.testing.assert_array_equal(target, [0.7, -0.1, 0.2])
         np.testing.assert_array_equal(bounds, [[0, 0, 0], [12, 12, 12]])
+        assert allowed_miss == 1e-3
         inputs = jnp.array([7.0, 2.0, 4.0])
-        return inverse.Reach(inputs, vsr.solve(scene, inputs, model=model), jnp.array(0.0 if close else 0.3), jnp.array(close))
+        miss = jnp.array(2e-4 if close else 0.3)
+        return inverse.Reach(inputs, vsr.solve(scene, inputs, model=model), miss, jnp.array(close), jnp.array(allowed_miss))
 
     monkeypatch.setattr(inverse, "reach", reach)
     file, out = tmp_path / "arm.toml", tmp_path / "found.json"
     file.write_text(scene.to_toml([1.0, 1.0, 1.0]))
-    arguments = ["reach", str(file), "--target", "0.7", "-0.1", "0.2", "--high", "12", "--steps", "8", "--json", str(out)]
-    assert cli.main(arguments) == (cli_common.DONE if close else cli_common.NOT_CONVERGED)
+    arguments = ["reach", str(file), "--target", "0.7", "-0.1", "0.2", "--high", "12", "--steps", "8", "--allowed-miss", "1e-3"]
+    assert cli.main([*arguments, "--json", str(out)]) == (cli_common.DONE if close else cli_common.NOT_CONVERGED)
     text = capsys.readouterr().out
     assert "  inputs     7, 2, 4\n" in text
-    assert ("out of reach" in text) != close
-    assert json.loads(out.read_text())["reached"] == close
+    verdict = "0.0002 m, within the" if close else "0.3 m, out of reach, this is the nearest found: more than the"
+    assert f"  miss       {verdict} 0.001 m allowed\n" in text
+    saved = json.loads(out.read_text())
+    assert (saved["reached"], saved["allowed_miss"]) == (close, 1e-3)
+
+
+@pytest.mark.slow
+def test_the_command_reaches_the_six_digits_that_it_printed(tmp_path, capsys, scene):
+    """Two tendons for a tip in space: no inputs meet rounded digits exactly."""
+    file = tmp_path / "arm.toml"
+    file.write_text(vsr.Scene(scene.rod, scene.actuators[:2]).to_toml([7.0, 2.0]))
+    assert cli.main(["solve", str(file), "--steps", "8"]) == cli_common.DONE
+    digits = re.search(r"  tip        \((.*), (.*), (.*)\) m", capsys.readouterr().out).groups()
+    arguments = ["reach", str(file), "--target", *digits, "--high", "12", "--steps", "8"]
+    assert cli.main(arguments) == cli_common.DONE
+    assert re.search(r"  miss       \S+ m, within the 7.5e-05 m allowed\n", capsys.readouterr().out)

@@ -66,6 +66,38 @@ def test_prescribed_converges_with_its_basis():
     assert errors[1] < min(1e-7, 1e-3 * errors[0])
 
 
+HEAVY = vsr.Scene(
+    vsr.Rod(0.5, vsr.Circular(0.01), vsr.Material(5e5, poisson=0.45, density=1100.0)),
+    [vsr.Tendon(vsr.Parallel(0.006, 0.0))],
+    [vsr.Gravity()],
+)
+BENDING = vsr.Prescribed(vsr.Basis.uniform(vsr.Legendre(3), ("bending_y", "bending_z")))
+
+
+def test_a_prescribed_basis_takes_few_steps_under_gravity():
+    """10 to 123 Newton steps, before anything bounded how far one turns the arm."""
+
+    def one(tension):
+        eq = vsr.solve(HEAVY, tension, model=BENDING)
+        return eq.status, eq.steps
+
+    status, steps = jax.jit(jax.vmap(one))(jnp.linspace(0.0, 5.0, 21)[:, None])
+    assert np.all(status == vsr.Status.CONVERGED)
+    assert np.max(steps) <= 15
+
+
+@pytest.mark.slow
+def test_two_batches_of_prescribed_solves_stand_in_one_program():
+    """LAPACK's batched routines side by side in one program waited for each other without end."""
+    tensions = jnp.linspace(0.0, 2.5, 1024)[:, None]
+
+    def tips(tensions):
+        return jax.vmap(lambda tension: vsr.solve(HEAVY, tension, model=BENDING).tip[:3, 3])(tensions)
+
+    first, second = jax.jit(lambda x: (tips(x), tips(2 * x)))(tensions)
+    np.testing.assert_allclose(second[:512:64], first[::128], atol=1e-9)
+
+
 def test_single_precision_holds_a_ten_thousandth_of_the_length():
     case = CASES["B1 gravity and tip force"]
     eq = vsr.solve(loaded_scene(case), jnp.asarray(case["tau"], jnp.float32), model=vsr.StrainDependent(16), throw=True)

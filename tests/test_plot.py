@@ -38,6 +38,16 @@ def test_strains_draws_the_named_ones_on_given_axes(eq):
     plt.close(figure)
 
 
+def test_stations_beyond_the_arm_are_refused(eq):
+    for draw in (
+        plot.sample,
+        lambda eq, stations: plot.arm(eq, stations=stations),
+        lambda eq, stations: plot.strains(eq, stations=stations),
+    ):
+        with pytest.raises(ValueError, match=r"stations: got 0\.8 m, need 0 to 0\.75 m, the ends of the arm"):
+            draw(eq, [0.1, 0.8])
+
+
 def test_a_failed_solve_is_not_drawn():
     failed = vsr.solve(paper.scene("A1"), [-500.0])
     with pytest.raises(ValueError, match="collapsed"):

@@ -79,6 +79,7 @@ def test_function_takes_parameters_that_can_be_differentiated():
     ("make", "message"),
     [
         (lambda: vsr.Helix(0.005), "Helix: got angle=None and pitch=None, need one of the two"),
+        (lambda: vsr.Helix(0.005, 87.6), r"Helix\.angle: got 87\.6, need a finite number > 0 and <= 1\.5708"),
         (lambda: vsr.Helix(0.0, 1.5), r"Helix\.radius: got 0\.0, need a finite number > 0"),
         (lambda: vsr.Helix(0.005, 1.5, hand="up"), r"Helix\.hand: got 'up', need one of 'right', 'left'"),
         (lambda: vsr.Linear("a", 0.0), r"Linear\.y: got 'a', need a finite number"),

@@ -84,6 +84,73 @@ def test_a_size_that_vanishes_somewhere_is_refused():
         vsr.Scene(arm, [])
 
 
+TUBE = vsr.Annular(vsr.Taper(0.02, 0.01), 0.015)
+
+
+@pytest.mark.parametrize(
+    ("section", "material", "rest", "message"),
+    [
+        (TUBE, {}, None, r"rod\.section\.inner: got 0\.015 m at X = 0\.5 m, need less than the outer radius everywhere"),
+        (vsr.Joined([0.2], [vsr.Circular(0.02), TUBE]), {}, None, r"rod\.section\.sections\[1\]\.inner: got 0\.015 m at X = 0\.5 m"),
+        (None, {"poisson": lambda x: 0.4 + x}, None, r"rod\.material\.poisson: got 0\.9 at X = 0\.5 m, need a ratio > -1 and <= 0\.5"),
+        (None, {"young": lambda x: 1e6 - 4e6 * x}, None, r"rod\.material\.young: got -1e\+06 at X = 0\.5 m, need a number > 0"),
+        (None, {"density": lambda x: 1e3 - 4e3 * x}, None, r"rod\.material\.density: got -1000 at X = 0\.5 m"),
+        (None, {}, (0.0, 0.0, 4.0, 0.0, 0.0, 0.0), r"rod\.rest_strain \(elongation\): got 0 at X = 0 m, need a number > 0"),
+    ],
+    ids=["tube", "joined tube", "poisson", "young", "density", "elongation"],
+)
+def test_numbers_of_the_rod_out_of_their_range_somewhere_are_refused(section, material, rest, message):
+    numbers = {"young": 1e6, "poisson": 0.5, **material}
+    arm = vsr.Rod(0.5, section or vsr.Circular(0.02), vsr.Material(**numbers), rest_strain=rest)
+    with pytest.raises(ValueError, match=message):
+        vsr.Scene(arm)
+
+
+def test_a_section_keeps_to_its_limits_where_it_is_laid():
+    joined = vsr.Joined([0.2], [TUBE, vsr.Circular(0.01)])
+    vsr.Scene(vsr.Rod(0.5, joined, vsr.Material(1e6, poisson=0.5)))
+
+
+BENT = vsr.Scene(ARM, [vsr.Tendon(vsr.Parallel(0.005, 0.0), start=0.1, end=0.3)], [vsr.TipWrench(force=(0.0, 0.1, 0.0))])
+STEPS = vsr.StrainDependent(8)
+
+
+@pytest.fixture(scope="module")
+def bent():
+    return vsr.solve(BENT, [1.0], model=STEPS)
+
+
+@pytest.mark.parametrize("X", [0.7, -0.1, [0.1, 0.7], np.nan], ids=["beyond", "before", "one of two", "nan"])
+@pytest.mark.parametrize("quantity", ["pose", "position", "strain", "reaction"])
+def test_places_beyond_the_arm_are_refused(bent, quantity, X):
+    with pytest.raises(ValueError, match=r"X: got (0\.7|-0\.1|nan) m, need 0 to 0\.5 m, the ends of the arm"):
+        getattr(bent, quantity)(X)
+
+
+@pytest.mark.parametrize(
+    ("index", "X", "message"),
+    [
+        (0, 0.4, r"X: got 0\.4 m, need 0\.1 to 0\.3 m, the ends of thread 0"),
+        (0, [0.2, 0.05], r"X: got 0\.05 m, need 0\.1 to 0\.3 m, the ends of thread 0"),
+        (1, 0.2, r"index: got 1, need the place of one of the scene's 1 actuators"),
+        (-1, 0.2, r"index: got -1, need"),
+        (0.0, 0.2, r"index: got 0\.0, need"),
+    ],
+)
+@pytest.mark.usefixtures("unchecked")
+def test_places_off_a_thread_are_refused(bent, index, X, message):
+    with pytest.raises(ValueError, match=message):
+        bent.thread(index, X)
+
+
+def test_single_precision_may_round_a_place_off_the_arm(bent):
+    single = vsr.solve(BENT, np.float32([1.0]), model=STEPS)
+    above = np.nextafter(np.float32(0.5), np.float32(1))
+    np.testing.assert_array_equal(single.position(above), single.position(np.float32(0.5)))
+    np.testing.assert_array_equal(bent.position([0.5 + 4e-7, -4e-7]), bent.position([0.5, 0.0]))
+    np.testing.assert_array_equal(bent.thread(0, [0.3 + 4e-7, 0.1]), bent.thread(0, [0.3, 0.1]))
+
+
 def test_discs_may_guide_threads_outside_the_section():
     arm = vsr.Rod(0.4, vsr.Circular(0.0007), vsr.Material(54e9, poisson=0.3), guide_radius=0.012)
     eq = vsr.solve(vsr.Scene(arm, [vsr.Tendon(vsr.Parallel(0.01, 0.0))]), [2.0])

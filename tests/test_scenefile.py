@@ -51,7 +51,7 @@ def full_scene() -> vsr.Scene:
         vsr.Joined([0.1, 0.2, 0.3], [vsr.Circular(radius), *wide]),
         vsr.Material(vsr.Taper(1e6, 2e6 / 3), shear=vsr.PolynomialProfile([3e5, 1.0]), density=1e3),
         rest_strain=(0.1, -0.0, wave, 1.0, 0.0, vsr.Constant(1e-9)),
-        base=np.linalg.qr(np.arange(16.0).reshape(4, 4) + np.eye(4))[0],
+        base=vsr.se3.exp(jnp.array([1 / 3, -0.7, 2.0, 0.1, 0.2, -1 / 7])),
     )
     actuators = [
         vsr.Thread(vsr.Helix(0.005, pitch=0.3, hand="left"), start=0.1 + 0.2),
@@ -88,6 +88,12 @@ def test_text_is_short_and_defaults_are_left_out():
     assert to_toml(short, [-5.0], "Case B1") == HELIX
     assert "inputs" not in to_toml(short)
     assert "title" not in to_toml(short)
+
+
+def test_a_diameter_is_read_and_kept_as_a_radius():
+    with_diameter = HELIX.replace("radius = 0.01\n", "diameter = 0.02\n")
+    assert same(parse_scene(with_diameter), parse_scene(HELIX))
+    assert to_toml(*parse_scene(with_diameter)) == HELIX
 
 
 def test_single_precision_is_written_in_its_own_decimals():
@@ -163,7 +169,14 @@ MISTAKES = [
     ('"Circular"', '"Helix"', rf"^rod\.section: unknown type 'Helix', {KNOWN_SECTIONS}$"),
     ('"Circular"', "3", rf"^rod\.section: unknown type 3, {KNOWN_SECTIONS}$"),
     ('type = "Circular"\n', "", "^rod.section: missing key 'type', known types are Annular, Circular"),
-    ("radius = 0.01\n", "", r"^rod\.section: missing key 'radius', known are radius, shear_correction$"),
+    ("radius = 0.01\n", "", r"^rod\.section: Circular: got radius=None and diameter=None, need one of the two$"),
+    ("radius = 0.01\n", "diametre = 0.02\n", r"^rod\.section: unknown key 'diametre', known are diameter, .*; did you mean 'diameter'\?$"),
+    ("radius = 0.01\n", "radius = 0.01\ndiameter = 0.02\n", r"^rod\.section: Circular: got radius=0\.01 and diameter=0\.02, need one of"),
+    (
+        "length = 0.75",
+        "length = 0.75\nbase = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]",
+        r"^rod: Rod\.base: got a reflection",
+    ),
     ("actuators = [", "loads = [", r"^loads\[0\]: unknown type 'Thread', known are DistributedWrench, Gravity"),
     ("young = 593000.0\n", "", r"^rod\.material: missing key 'young', known are density, poisson, shear, young$"),
     ("shear = 200000.0\n", "", r"^rod\.material: Material: got shear=None and poisson=None, need one of the two$"),

@@ -16,6 +16,10 @@ def geometry(section):
     return section.geometry(X, L)
 
 
+def based(base):
+    return vsr.Rod(1.0, vsr.Circular(0.01), STEEL, base=base)
+
+
 def test_circle():
     shape = geometry(vsr.Circular(vsr.Taper(0.012, 0.010)))
     r = 0.012 - 0.002 * 0.4
@@ -102,6 +106,14 @@ def test_a_python_function_is_a_profile():
         (lambda: vsr.Circular(0.01, shear_correction=[1, 1, 1]), "shear_correction: got shape"),
         (lambda: vsr.Material(1e6), "Material: got shear=None and poisson=None, need one of the two"),
         (lambda: vsr.Material(1e6, shear=1e5, poisson=0.3), "need one of the two"),
+        (lambda: vsr.Circular(), r"Circular: got radius=None and diameter=None, need one of the two"),
+        (lambda: vsr.Circular(0.01, diameter=0.02), r"Circular: got radius=0\.01 and diameter=0\.02, need one of the two"),
+        (lambda: vsr.Circular(diameter=-0.02), r"Circular\.diameter: got -0\.02, need a finite number > 0"),
+        (lambda: vsr.Annular(0.01, 0.02), r"Annular\.inner: got 0\.02 m, need less than the outer radius, 0\.01 m"),
+        (lambda: vsr.Annular(0.01, 0.01), r"Annular\.inner: got 0\.01 m, need less"),
+        (lambda: vsr.Material(1e6, poisson=0.6), r"Material\.poisson: got 0\.6, need a finite number > -1 and <= 0\.5"),
+        (lambda: vsr.Material(1e6, poisson=-1), r"Material\.poisson: got -1, need"),
+        (lambda: vsr.Material(1e6, poisson=vsr.Piecewise([0.1], [0.3, 0.7])), r"Material\.poisson \(Piecewise\.values\[1\]\): got"),
         (lambda: vsr.Material(-1e6, shear=1e5), r"Material\.young: got -1000000\.0"),
         (lambda: vsr.PolynomialProfile([[0.1]]), "need at least one number in a row"),
         (lambda: vsr.Rod(0.0, vsr.Circular(0.01), STEEL), r"Rod\.length: got 0\.0"),
@@ -109,9 +121,47 @@ def test_a_python_function_is_a_profile():
         (lambda: vsr.Rod(1.0, vsr.Circular(0.01), 2e11), r"Rod\.material: got .*, need a Material"),
         (lambda: vsr.Rod(1.0, vsr.Circular(0.01), STEEL, rest_strain=[0, 0]), r"Rod\.rest_strain: got \[0, 0\], need six profiles"),
         (lambda: vsr.Rod(1.0, vsr.Circular(0.01), STEEL, base=np.eye(3)), r"Rod\.base: got shape \(3, 3\)"),
+        (lambda: based(np.diag([1.0, 1.0, -1.0, 1.0])), r"Rod\.base: got a reflection \(.* determinant -1\), need a rigid transform"),
+        (lambda: based(np.diag([2.0, 2.0, 2.0, 1.0])), r"Rod\.base: got columns of a rotation that are not orthonormal \(.* by 3\)"),
+        (lambda: based(np.diag([0.0, 0.0, 0.0, 1.0])), r"Rod\.base: got a rotation of zeros"),
+        (lambda: based(np.eye(4) + np.eye(4, k=-3)), r"Rod\.base: got a last row of 1 0 0 1"),
+        (lambda: vsr.objective.TipError([np.eye(4), np.diag([1.0, 1.0, -1.0, 1.0])]), r"TipError\.targets\[1\]: got a reflection"),
     ],
 )
 @pytest.mark.usefixtures("unchecked")
 def test_refusals_say_what_and_where(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_a_base_needs_six_digits_in_double_precision_and_three_in_single():
+    pose = np.asarray(vsr.se3.exp(jnp.array([0.3, -0.7, 2.0, 0.1, 0.2, 0.3])))
+    based(pose.round(6))
+    based(pose.round(4).astype(np.float32))
+    with pytest.raises(ValueError, match=r"Rod\.base: got columns of a rotation that are not orthonormal"):
+        based(pose.round(4))
+
+
+@pytest.mark.parametrize(
+    "diameter",
+    [
+        0.02,
+        vsr.Constant(0.02),
+        vsr.Taper(0.02, 0.016),
+        vsr.PolynomialProfile([0.02, -0.01, 0.003]),
+        vsr.SplineProfile([0.0, 0.2, 0.5, 0.75], [0.02, 0.021, 0.018, 0.016]),
+        vsr.Piecewise([0.1], [vsr.Taper(0.02, 0.018), 0.016]),
+        lambda x: 0.02 - 0.01 * x,
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_a_diameter_is_twice_the_radius(diameter):
+    section = vsr.Circular(diameter=diameter)
+    wide = vsr.Circular(diameter)  # taken for a radius
+    np.testing.assert_allclose(geometry(section).moment_y, geometry(wide).moment_y / 16, rtol=1e-13)
+    np.testing.assert_array_equal(section.breakpoints, wide.breakpoints)
+
+
+def test_a_diameter_may_be_traced():
+    slope = jax.grad(lambda d: vsr.Circular(diameter=d).geometry(X, L).area)(0.02)
+    np.testing.assert_allclose(slope, np.pi * 0.02 / 2, rtol=1e-13)

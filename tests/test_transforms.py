@@ -117,6 +117,33 @@ def test_a_scene_may_be_built_under_jit():
     np.testing.assert_allclose(tip(0.005), vsr.solve(paper.scene("B1"), [-15.0]).tip[:3, 3], atol=1e-13)
 
 
+@pytest.mark.parametrize(
+    "quantity", [*(pytest.param(name, marks=pytest.mark.slow) for name in ("position", "reaction")), "strain", "thread"]
+)
+def test_traced_places_beyond_the_arm_are_nan_and_harm_no_others(quantity):
+    arm = vsr.Rod(0.5, vsr.Circular(lambda x: 0.01 + 0.002 * jnp.sqrt(0.5 - x)), vsr.Material(1e6, poisson=0.5))  # NaN beyond the arm
+    scene = vsr.Scene(arm, [vsr.Tendon(vsr.Parallel(0.005, 0.0), end=0.3)], [vsr.TipWrench(force=(0.0, 0.1, 0.0))])
+    eq = vsr.solve(scene, jnp.array([1.0]), model=vsr.StrainDependent(8))
+
+    def at(X):
+        return eq.thread(0, X) if quantity == "thread" else getattr(eq, quantity)(X)
+
+    @jax.jit
+    def found_and_slope(X):
+        return at(X), jax.grad(lambda X: jnp.nansum(at(X)))(X)
+
+    on, off = jnp.array([0, 1, 3]), jnp.array([2, 4])
+    X = jnp.array([0.0, 0.2, 0.7, 0.3, -0.1])
+    found, slope = found_and_slope(X)
+    wanted, wanted_slope = found_and_slope(X.at[off].set(0.1))
+    assert np.all(np.isnan(found[off]))
+    np.testing.assert_array_equal(found[on], wanted[on])
+    np.testing.assert_array_equal(slope[off], 0)
+    np.testing.assert_array_equal(slope[on], wanted_slope[on])
+    assert np.all(np.isfinite(wanted[on]))
+    assert np.all(np.isfinite(slope))
+
+
 @pytest.mark.slow
 def test_gradients_in_single_precision(helix):
     def height(scene, tau):
@@ -127,3 +154,50 @@ def test_gradients_in_single_precision(helix):
     assert single.radius.dtype == jnp.float32
     np.testing.assert_allclose(single.radius, double.radius, rtol=2e-4)
     np.testing.assert_allclose(single.angle, double.angle, rtol=2e-4)
+
+
+LOADED = vsr.Scene(
+    vsr.Rod(0.3, vsr.Circular(vsr.Taper(0.011, 0.009)), vsr.Material(1e6, poisson=0.45, density=1000.0)),
+    [
+        vsr.Tendon(vsr.Parallel(0.007, 0.0), control="length", stiffness=2e3, friction=0.1),
+        vsr.Tendon(vsr.Helix(0.007, pitch=0.4), end=0.2),
+    ],
+    [vsr.Gravity(), vsr.PointWrench(0.15, force=(0.0, 0.03, 0.0), frame="body")],
+)
+STEPS = {"strain-dependent": vsr.StrainDependent(8), "prescribed": vsr.Prescribed(vsr.Basis.uniform(vsr.Legendre(2)), steps=8)}
+
+
+@pytest.mark.parametrize("name", STEPS)
+def test_loaded_solves_mix_no_precisions(name, dtype):
+    """Tracing is enough: under strict promotion JAX refuses a single operation between two precisions."""
+
+    def height(inputs):
+        eq = vsr.solve(LOADED, inputs, model=STEPS[name])
+        return eq.tip[2, 3] + eq.error.tip
+
+    with jax.numpy_dtype_promotion("strict"):
+        assert jax.eval_shape(jax.grad(height), jnp.array([-0.01, 2.0], dtype)).dtype == dtype
+
+
+@pytest.mark.parametrize("name", STEPS)
+def test_an_empty_batch_of_loaded_scenes_is_empty(name):
+    hanging = vsr.Scene(LOADED.rod, [vsr.Tendon(vsr.Parallel(0.007, 0.0))], [vsr.Gravity()])
+
+    def height(inputs):
+        return vsr.solve(hanging, inputs, model=STEPS[name]).tip[2, 3]
+
+    both = jax.vmap(jax.value_and_grad(height))
+    value, slope = jax.eval_shape(both, jnp.zeros((0, 1)))
+    assert (value.shape, slope.shape) == ((0,), (0, 1))
+
+
+@pytest.mark.parametrize("half", ["float16", "bfloat16"])
+def test_half_precision_is_refused_by_name(half, unchecked):
+    half = jnp.dtype(half)
+    for make, name in (
+        (lambda: vsr.solve(LOADED, jnp.zeros(2, half)), "inputs"),
+        (lambda: LOADED.astype(half), "dtype"),
+        (lambda: vsr.Circular(jnp.asarray(0.01, half)), "Circular.radius"),
+    ):
+        with pytest.raises(ValueError, match=f"{name}: got {half}, need float32 or float64"):
+            make()

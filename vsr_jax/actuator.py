@@ -102,8 +102,9 @@ class Tendon(Actuator):
     (infinite by default).
 
     With friction the tension decays with the turning angle $\varphi$ of the cable from its start, $T(X) = T e^{\mp \mu \varphi(X)}$
-    (the capstan equation): minus while the motor pulls, plus while it releases. The input and the tension found are those
-    at the start.
+    (the capstan equation): minus while the motor pulls, plus while it releases. The angle counts the kinks of the path: corners of
+    its routing, and places where the strain jumps, as where another tendon ends. There it converges by the order of the nodes of
+    a step, third for steps of order 6. The input and the tension found are those at the start.
 
     **Arguments:**
     - `routing`, `start`, `end`: as for every actuator.

@@ -31,7 +31,7 @@ def side_by_side(solve: Callable) -> Callable:
         # copies of the last arm fill the row; of an empty batch there is none
         place = jnp.minimum(jnp.arange(lanes), max(size - 1, 0))
 
-        def row(x: jax.Array, along: bool) -> jax.Array:
+        def row(x: Any, along: bool) -> Any:
             if not along:
                 return x[..., None]
             x = x if size else jnp.zeros((1, *x.shape[1:]), x.dtype)

@@ -36,7 +36,10 @@ class Cable(NamedTuple):
         """Stretch per unit of the tension at the start [m/N]; `share` of it is left further on."""
         if self.compliance is None:
             return jnp.zeros_like(self.length)
-        mean = 1.0 if share is None else jnp.sum(grid.weight * share, axis=(0, 1)) / jnp.sum(grid.weight * (share > 0), axis=(0, 1))
+        if share is None:
+            return self.length * self.compliance
+        reached = jnp.sum(jnp.where(share > 0, grid.weight, 0.0), axis=(0, 1))
+        mean = jnp.sum(grid.weight * share, axis=(0, 1)) / reached
         return self.length * self.compliance * mean
 
 

@@ -2,7 +2,8 @@
 
 import argparse
 import os
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,12 @@ def check_folders(*paths: str | None) -> None:
     for path in paths:
         if path is not None and not Path(path).parent.is_dir():
             raise ValueError(f"{path}: there is no folder {str(Path(path).parent)!r}")
+
+
+def warn(sentences: Iterable[str]) -> None:
+    """Prints warnings to stderr, each in a line."""
+    for sentence in sentences:
+        print(f"vsr-jax: warning: {sentence}", file=sys.stderr)
 
 
 def add_bounds(parser: argparse.ArgumentParser, usual: str) -> None:

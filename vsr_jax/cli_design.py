@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from .cli_common import DONE, NOT_CONVERGED, add_precision, check_folders, command, hasten, use
+from .cli_common import DONE, NOT_CONVERGED, add_precision, check_folders, command, hasten, use, warn
 from .cli_scene import save
 from .designfile import load_design
+from .plausible import warnings_of
 
 
 def add_design(commands: Any) -> None:
@@ -39,6 +40,7 @@ def _design(options: argparse.Namespace) -> int:
     use(options.precision)
     check_folders(options.out, options.json, options.plot, options.keep)
     task = load_design(options.problem)
+    warn(warnings_of(task.scene))
     inputs = np.asarray(task.inputs, options.precision)
     found = design(task.scene, task.free, task.objective, inputs, out=options.keep, **task.settings)
     known = parameters(found.scene)

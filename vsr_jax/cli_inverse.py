@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from . import report
-from .cli_common import DONE, NOT_CONVERGED, add_bounds, bounds, check_folders, command, hasten
+from .cli_common import DONE, NOT_CONVERGED, add_bounds, bounds, check_folders, command, hasten, warn
 from .cli_scene import add_scene, model_between, save, task_of
+from .plausible import strain_warnings
 
 
 def add_reach(commands: Any) -> None:
@@ -25,6 +26,9 @@ def add_reach(commands: Any) -> None:
     add_scene(parser)
     parser.add_argument("--target", metavar=("X", "Y", "Z"), nargs=3, type=float, required=True, help="place of the tip [m]")
     add_bounds(parser, "twice --inputs, or those of the file")
+    parser.add_argument(
+        "--allowed-miss", metavar="M", type=float, help="distance [m] from the target that counts as reached (default: 1e-4 of the length)"
+    )
     parser.add_argument("--json", metavar="FILE", help="save target, inputs, miss and the pose of the tip")
 
 
@@ -36,15 +40,18 @@ def _reach(options: argparse.Namespace) -> int:
     check_folders(options.json)
     low, high = bounds(options.low, options.high, 2 * np.asarray(task.inputs))
     model = model_between(task, options.tolerance, low, high)
-    found = reach(task.scene, jnp.asarray(options.target, task.inputs.dtype), (low, high), model=model)
+    found = reach(task.scene, jnp.asarray(options.target, task.inputs.dtype), (low, high), model=model, allowed_miss=options.allowed_miss)
     print("\n".join(report.lines(found.equilibrium, task.title or options.scene)))
     print(f"  inputs     {', '.join(f'{value:.6g}' for value in np.asarray(found.inputs))}")
-    print(f"  miss       {float(found.miss):.2g} m" + ("" if bool(found.reached) else ": out of reach, this is the nearest found"))
+    verdict = "within the" if bool(found.reached) else "out of reach, this is the nearest found: more than the"
+    print(f"  miss       {float(found.miss):.2g} m, {verdict} {float(found.allowed_miss):.2g} m allowed")
+    warn(strain_warnings(found.equilibrium))
     if options.json:
         outcome = {
             "target": options.target,
             "inputs": np.asarray(found.inputs).tolist(),
             "miss": float(found.miss),
+            "allowed_miss": float(found.allowed_miss),
             "reached": bool(found.reached),
             "tip": np.asarray(found.equilibrium.tip).tolist(),
         }

@@ -12,12 +12,13 @@ import numpy as np
 from jaxtyping import Array
 
 from .basis import Basis, Legendre
-from .cli_common import DONE, NOT_CONVERGED, add_precision, check_folders, command, hasten, positive, use
+from .cli_common import DONE, NOT_CONVERGED, add_precision, check_folders, command, hasten, positive, use, warn
 from .discrete import Prescribed
 from .equilibrium import Equilibrium
 from .health import check
 from .model import Model
 from .plan import plan
+from .plausible import strain_warnings, warnings_of
 from .scene import Scene
 from .scenefile import load_scene
 from .solve import solve
@@ -106,12 +107,13 @@ class Task(NamedTuple):
 
 
 def task_of(options: argparse.Namespace) -> Task:
-    """What is to be solved, in the precision asked for.
+    """What is to be solved, in the precision asked for; warns of implausible numbers.
 
     **Raises:** `ValueError` for a file or numbers that make no sense.
     """
     use(options.precision)
     scene, inputs, title = load_scene(options.scene)
+    warn(warnings_of(scene))
     inputs = inputs if options.inputs is None else options.inputs
     if inputs is None and scene.actuators:
         kinds = ", ".join(type(actuator).__name__ for actuator in scene.actuators)
@@ -136,6 +138,7 @@ def _solve(options: argparse.Namespace) -> int:
     check_folders(options.plot, options.json)
     eq = solve(scene, inputs, model=model, tolerance=options.tolerance)
     _tell(eq, title, options)
+    warn(strain_warnings(eq))
     return DONE if bool(eq.converged) else NOT_CONVERGED
 
 
@@ -148,6 +151,7 @@ def _check(options: argparse.Namespace) -> int:
     model = model if options.tolerance is None else solve(scene, inputs, tolerance=options.tolerance).model
     health = check(scene, inputs, model=model)
     print("\n".join(report.health_lines(health, title or options.scene)))
+    warn(strain_warnings(health.equilibrium))
     if options.json:
         save(options.json, {"scene": options.scene, "title": title, **report.health_record(health)})
     return DONE if bool(health.equilibrium.converged) else NOT_CONVERGED

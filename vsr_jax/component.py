@@ -14,6 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ._types import cast
+
 Vector = tuple[Array, ...]
 Matrix = tuple[Vector, ...]
 Tree = TypeVar("Tree")
@@ -31,7 +33,7 @@ def keep(tree: Tree, like: Array) -> Tree:
 
 def single(tree: Tree) -> Tree:
     """The same values in single precision; integers and truth values as they are."""
-    return jax.tree.map(lambda x: x.astype(jnp.float32) if jnp.issubdtype(x.dtype, jnp.floating) else x, tree)
+    return cast(tree, jnp.float32)
 
 
 def split(array: Array) -> Vector:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from . import component as c
+from ._types import cast
 from .balance import chosen, solve_balance, spread, with_locked
 from .batching import arms_in, side_by_side
 from .component import Vector
@@ -81,7 +82,9 @@ def _start(problem: Problem, kind: Kind) -> Unknown:
     tau = problem.sections.carry(with_tensions(problem.forces, tension, kind))
     alone = solve_balance(*c.single((problem.sections, tau)), None, kind.free)
     sound = alone.balanced & alone.definite
-    xi = tuple(jnp.where(sound, x.astype(rest.dtype), rest) for x, rest in zip(alone.xi, problem.sections.rest, strict=True))
+    rest = problem.sections.rest
+    xi = tuple(jnp.where(sound, x.astype(x0.dtype), x0) for x, x0 in zip(alone.xi, rest, strict=True))
+    xi = with_locked(xi, rest, kind.free)  # these are never corrected
     return Unknown(xi, tension, (jnp.zeros_like(xi[0]),) * len(kind.rubbing))
 
 
@@ -99,6 +102,7 @@ class _Sizes(NamedTuple):
 
     def of_step(self, step: Unknown, at: State) -> Array:
         """Largest change of the shape, of what a tension does to it, or of what friction takes of one."""
+        step = cast(step, self.grid.h.dtype)
         tensions = [
             tension * pull_of(self.sections, place, self.length) for place, tension in zip(self.kind.cables, step.tension, strict=True)
         ]
@@ -116,12 +120,13 @@ class _Sizes(NamedTuple):
 
     def turn(self, step: Unknown) -> Array:
         """How far the step bends and twists the arm in all [rad]."""
-        x, y, z = (jnp.abs(k) for k in step.xi[:3])
+        x, y, z = (jnp.abs(k) for k in cast(step.xi[:3], self.grid.h.dtype))
         return jnp.sum(self.grid.weight * (x + y + z), axis=(0, 1))
 
     def work(self, wrench: Vector, step: Unknown) -> Array:
         """Work of the imbalance over a step; only its sign and its rough size matter."""
-        return jnp.sum(c.single(self.grid.weight) * c.dot(wrench, chosen(step.xi, self.kind.free)), axis=(0, 1))
+        work = jnp.sum(c.single(self.grid.weight) * c.dot(wrench, chosen(step.xi, self.kind.free)), axis=(0, 1))
+        return work.astype(self.grid.h.dtype)
 
     def _rubbed(self, rates: Vector, at: State) -> list[Array]:
         """Changes of turning rates by what they make of the tensions."""

@@ -9,6 +9,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from . import component as c, lu
+from ._types import cast
 from .balance import chosen, spread, tangent, thread_direction, thread_wrench
 from .component import Vector
 from .coupled import Imbalance, Kind, Problem, State, Unknown, state_of
@@ -27,7 +28,8 @@ _FINAL, _ACCEPTED = 8.0, 1e4
 def approximate_solve(
     unknown: Unknown, at: State, right: Imbalance, problem: Problem, kind: Kind, damping: Array | float = 0.0
 ) -> tuple[Unknown, Array]:
-    """Solution of the tangent system, nearly (see `elimination`; friction's own tangent is left out), and whether it is definite.
+    """Solution of the tangent system, nearly (see `elimination`; friction's own tangent is left out), and whether it is definite
+    for the changes of shape that taut cables allow.
 
     In single precision throughout, the solution too: the passes along the arm move memory more than they compute, and what
     is lost is far less than what the elimination leaves out.
@@ -40,26 +42,32 @@ def approximate_solve(
     def solve(b: Vector) -> tuple[Vector, Array]:
         return eliminate(lower, b, unknown.xi, at.along, problem.loads, grid, kind.free)
 
-    strain, definite = solve(spread(right.wrench, kind.free))
+    strain, negative = solve(spread(right.wrench, kind.free))
     if not kind.cables:
-        return Unknown(strain, (), right.turning), definite
+        return Unknown(strain, (), right.turning), negative == 0
     units = [thread_wrench(thread_direction(unknown.xi, sections.paths[i])[0], sections.paths[i]) for i in kind.cables]
     pulls = [_times(at.carried[i], unit) for i, unit in zip(kind.cables, units, strict=True)]
     lengths = [_times(sections.reach[i], unit) for i, unit in zip(kind.cables, units, strict=True)]
     answers, _ = jax.vmap(solve)(jax.tree.map(lambda *v: jnp.stack(v), *pulls))
     shortening = jnp.stack([jnp.sum(grid.weight * c.dot(length, answers), axis=(1, 2)) for length in lengths])
     given = jnp.stack([jnp.sum(grid.weight * c.dot(length, strain), axis=(0, 1)) for length in lengths])
-    tension = _tensions(unknown, at, right, problem, kind, shortening, given)
+    tension, held = _tensions(unknown, at, right, problem, kind, shortening, given)
     strain = tuple(a - jnp.sum(tension[:, None, None] * answer, axis=0) for a, answer in zip(strain, answers, strict=True))
-    return Unknown(strain, tuple(tension), right.turning), definite
+    return Unknown(strain, tuple(tension), right.turning), negative == held
 
 
 def _times(share: Array | None, wrench: Vector) -> Vector:
     return wrench if share is None else c.scale(share, wrench)
 
 
-def _tensions(unknown: Unknown, at: State, right: Imbalance, problem: Problem, kind: Kind, shortening: Array, given: Array) -> Array:
-    """Tensions of the cables from the equations left when the strain is eliminated; `shortening`: by each cable of each."""
+def _tensions(
+    unknown: Unknown, at: State, right: Imbalance, problem: Problem, kind: Kind, shortening: Array, given: Array
+) -> tuple[Array, Array]:
+    """Tensions of the cables from the equations left when the strain is eliminated, and the number of negative pivots of these.
+
+    `shortening`: by each cable of each. Taut cables hold as many motions in which the arm alone would fall as these equations have
+    negative pivots: no more are left where the tangent has no more negative eigenvalues.
+    """
     rows, sides = [], []
     for i, (place, cable, tension, slack) in enumerate(zip(kind.cables, problem.cables, unknown.tension, at.slack, strict=True)):
         slack_now = tension < cable.scale * slack
@@ -69,10 +77,8 @@ def _tensions(unknown: Unknown, at: State, right: Imbalance, problem: Problem, k
             row = row + unit * cable.stretch(at.carried[place], problem.grid)
         rows.append(jnp.where(slack_now, unit, cable.scale * row))
         sides.append(jnp.where(slack_now, right.cable[i], right.cable[i] + cable.scale * given[i]))
-    solve = lu.solve
-    for _ in range(given.ndim - 1):  # arms side by side, in the last axes
-        solve = jax.vmap(solve, in_axes=-1, out_axes=-1)
-    return solve(jnp.stack(rows), jnp.stack(sides))
+    factors = lu.factor(jnp.stack(rows))
+    return lu.substitute(factors, jnp.stack(sides)), jnp.sum(lu.diagonal(factors) < 0, axis=0, dtype=jnp.int32)
 
 
 def tangent_solve(imbalance: Callable, unknown: Unknown, problem: Problem, right: Imbalance, kind: Kind) -> Imbalance:
@@ -91,7 +97,7 @@ def tangent_solve(imbalance: Callable, unknown: Unknown, problem: Problem, right
 
     def nearly(b: Imbalance) -> Imbalance:
         step, _ = approximate_solve(unknown, at, b, problem, kind)
-        step = jax.tree.map(lambda x: x.astype(problem.grid.h.dtype), step)
+        step = cast(step, problem.grid.h.dtype)
         return Imbalance(chosen(step.xi, kind.free), step.tension, step.turning)
 
     def scaled_apply(x: Array) -> Array:

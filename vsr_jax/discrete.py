@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from . import component as c, galerkin, lu
-from ._check import choice, count, instance
+from ._check import ROUNDING, choice, count, instance, on_arm
 from ._types import Scalar
 from .balance import forces_where, residual, rounding_floor, tangent, thread_direction, thread_wrench
 from .basis import AbstractBasis
@@ -20,7 +20,7 @@ from .implicit import change_of, no_derivative
 from .kinematics import ORDERS, accumulate_jacobian
 from .model import Nodes, Outcome, Status, SteppedModel, classify
 from .newton import Evaluation, newton
-from .quadrature import Grid, make_grid
+from .quadrature import Grid, make_grid, onto
 from .scene import CrossSections, Scene
 
 
@@ -238,14 +238,18 @@ def jacobian(
     - `X`: abscissa [m], the tip by default.
     - `steps`, `order`: steps on [0, X] and their order.
 
-    **Returns:** shape (6, n), angular part first.
+    **Returns:** shape (6, n), angular part first; NaN for a traced X beyond the arm.
+
+    **Raises:** `ValueError` for X beyond the arm.
     """
     length = scene.rod.length
-    end = length if X is None else jnp.asarray(X, length.dtype)
+    on_arm("X", length if X is None else X, length)
+    end, near = onto(length if X is None else jnp.asarray(X, length.dtype), 0.0, length, ROUNDING * length)
     edges = jnp.minimum(scene.edges(basis.breakpoints(length)), end)
     grid = make_grid(edges, steps, choice("order", order, ORDERS) // 2)
     nodes = grid.X.T.reshape(-1)
     matrix = jax.vmap(lambda x: basis.matrix(x, length))(nodes)
     xi = matrix @ q + c.join(scene.sections(nodes).rest)
     shape = grid.X.T.shape
-    return accumulate_jacobian(xi.reshape(*shape, 6), matrix.reshape(*shape, 6, -1), grid.h)
+    J = accumulate_jacobian(xi.reshape(*shape, 6), matrix.reshape(*shape, 6, -1), grid.h)
+    return jnp.where(near, J, jnp.nan)

@@ -26,6 +26,9 @@ from .component import Matrix, Vector
 from .quadrature import Grid
 from .reaction import Loading, Reaction, turned
 
+UNSTABLE_SECTION = 1_000_000
+"""Number of negative eigenvalues that stands for a section that is unstable by itself: more than cables can hold."""
+
 
 class Cell(NamedTuple):
     r"""What the elimination knows of one node before it comes to it, in the frame of its section.
@@ -66,7 +69,8 @@ class Linear(NamedTuple):
 def eliminate(
     lower: Matrix, right: Vector, xi: Vector, along: Reaction | None, loads: Loading | None, grid: Grid, free: tuple[int, ...]
 ) -> tuple[Vector, Array]:
-    r"""Solution of the tangent system with the right side $b$ for the free strains, and whether the tangent is positive definite.
+    r"""Solution of the tangent system with the right side $b$ for the free strains, and the number of negative eigenvalues of the
+    tangent: zero where it is positive definite, `UNSTABLE_SECTION` where a section is unstable by itself.
 
     **Arguments:** node arrays of shape (stages, steps) and that of the arms side by side: `lower`, the lower triangle of $H$;
     `right`, $b$, six components; `xi` and `along`, the strain where the tangent is taken and its reaction; without loads $H$
@@ -76,7 +80,7 @@ def eliminate(
     """
     if along is None or loads is None or min(free) > 2:
         x = c.cholesky_solve(c.cholesky(chosen_rows(lower, free)), chosen(right, free))
-        return spread(x, free), ~jnp.any(jnp.isnan(x[-1]), axis=(0, 1))
+        return spread(x, free), jnp.where(jnp.any(jnp.isnan(x[-1]), axis=(0, 1)), UNSTABLE_SECTION, 0)
     flat = jax.tree.map(_flat, (lower, right, xi, along.wrench, along.rotation))
     lower, right, xi, wrench, rotation = c.keep(flat, flat[1][0])
     loads = loads._replace(follower_density=jax.tree.map(_flat, loads.follower_density))
@@ -85,7 +89,7 @@ def eliminate(
     zero = jnp.zeros_like(right[0][0])
     nothing = (zero, zero, zero)
     size = 6 if loads.follows else 3
-    _, (X, x, push, definite) = lax.scan(_cell, ((nothing,) * size, (zero,) * size), cells, reverse=True)
+    _, (X, x, push, negative) = lax.scan(_cell, ((nothing,) * size, (zero,) * size), cells, reverse=True)
 
     def forward(theta: Vector, cell: tuple) -> tuple[Vector, tuple[Vector, Vector]]:
         X, x, turn, width = cell
@@ -98,7 +102,7 @@ def eliminate(
         force = c.add(force, c.add(c.matvec(push[0], c.add(theta, c.scale(cells.width, kappa))), push[1]))
     upsilon = c.subtract(c.matvec(linear.flexibility, force), c.matvec(linear.by_bend, kappa))
     strain = tuple(_unflat(x, grid) for x in (*kappa, *upsilon))
-    return strain, jnp.all(definite & local, axis=0)
+    return strain, jnp.where(jnp.all(local, axis=0), jnp.sum(negative, axis=0), UNSTABLE_SECTION)
 
 
 def _flat(x: Array) -> Array:
@@ -209,21 +213,20 @@ def _cell(end: tuple[Matrix, Vector], cell: Cell) -> tuple[tuple[Matrix, Vector]
     less = c.scale(-cell.width, Q)
     pivot = tuple(tuple(1.0 + x if i == j else x for j, x in enumerate(row)) for i, row in enumerate(less))
     adjugate, det = c.adjugate(pivot)
-    # all eigenvalues of a matrix are positive, if they are real, when the coefficients of its characteristic polynomial alternate
-    definite = (_trace(pivot) > 0) & (_trace(adjugate) > 0) & (det > 0)
+    negative = _negative(_trace(pivot), _trace(adjugate), det)
     solved = c.matmul(adjugate, c.add(Q, cell.by_theta)), c.matvec(adjugate, c.add(q, cell.bend))
     X, x = jax.tree.map(lambda entry: entry / det, solved)
     by_bend = c.add(c.scale(cell.width, rows), cell.by_bend)
     start = c.add(c.add(rows, cell.moment), c.matmul(by_bend, X))
     start_p = c.add(c.add(rows_p, cell.moment_0), c.matvec(by_bend, x))
     if len(p) == 3:
-        return (start, start_p), (X, x, None, definite)
+        return (start, start_p), (X, x, None, negative)
     by_bend, force = c.scale(cell.width, P[3:]), P[3:]
     if cell.force is not None:
         by_bend, force = c.add(by_bend, c.scale(cell.width, cell.force)), c.add(force, c.scale(2.0, cell.force))
     start = (*start, *c.add(force, c.matmul(by_bend, X)))
     start_p = (*start_p, *c.add(p[3:], c.matvec(by_bend, x)))
-    return (start, start_p), (X, x, (P[3:], p[3:]), definite)
+    return (start, start_p), (X, x, (P[3:], p[3:]), negative)
 
 
 def _seen_from_here(P: Matrix, p: Vector, cell: Cell) -> tuple[Matrix, Vector]:
@@ -243,6 +246,13 @@ def _carried(P: Matrix, p: Vector, cell: Cell, part: float) -> tuple[Matrix, Vec
     arm = c.skew(c.scale(part * cell.width, cell.axis))
     moment, moment_p = c.add(P[:3], c.matmul(arm, P[3:])), c.add(p[:3], c.matvec(arm, p[3:]))
     return (*moment, *P[3:]), (*moment_p, *p[3:])
+
+
+def _negative(trace: Array, minors: Array, det: Array) -> Array:
+    """Negative eigenvalues of a matrix of three rows, if all are real: three less the changes of sign of its characteristic polynomial."""
+    first, second, third = trace > 0, minors > 0, det > 0
+    changes = (first, first == second, second == third)
+    return 3 - sum((change.astype(jnp.int32) for change in changes), jnp.zeros(trace.shape, jnp.int32))
 
 
 def _trace(matrix: Matrix) -> Array:

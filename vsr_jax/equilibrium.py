@@ -1,19 +1,22 @@
 """What a solve returns: the status, and the shape, strains, stability and thread lengths computed when asked for."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from . import component as c
-from ._check import is_traced
+from ._check import ROUNDING, is_traced, on_arm
 from ._types import Pose, Scalar
 from .balance import forces_where
 from .cable import cable_of, path_length
 from .component import Vector
 from .estimate import Error, error_of
 from .model import Model, Nodes, Outcome, Status
+from .quadrature import onto
 from .reaction import loading, react_at
 from .scene import Scene
 from .stability import extremes
@@ -23,7 +26,8 @@ class Equilibrium(eqx.Module):
     """A solved scene.
 
     Every quantity is computed when it is asked for, so that a program that only needs the tip computes only the tip.
-    Where the solve failed every quantity is NaN and `status` says why.
+    Where the solve failed every quantity is NaN and `status` says why. A quantity at abscissas X [m] takes one or several in a row,
+    from 0 to the arm's length. It raises `ValueError` for an X beyond the arm where both are known, and is NaN there under `jax.jit`.
 
     **Fields:** `scene`, `inputs` [of the actuators], `model`; `status`, a `Status` as an integer; `steps`, the Newton
     steps taken (integration steps for `Continuum`).
@@ -124,8 +128,17 @@ class Equilibrium(eqx.Module):
         return self._reaction(self._abscissas(X))
 
     def thread(self, index: int, X: Any) -> Float[Array, "... 3"]:
-        """Position [m] of thread `index` where it crosses the sections at X: $r + R d$."""
-        return self._thread(index, self._abscissas(X))
+        """Position [m] of thread `index` where it crosses the sections at X: $r + R d$.
+
+        **Arguments:** `index`: place of its actuator in the scene, from 0; `X` [m]: between the thread's start and end.
+
+        **Raises:** `ValueError` for another index, and for a known X where the thread is not (NaN under `jax.jit`).
+        """
+        X, number = self._abscissas(X), len(self.scene.actuators)
+        if isinstance(index, bool) or not isinstance(index, int | np.integer) or not 0 <= index < number:
+            raise ValueError(f"index: got {index!r}, need the place of one of the scene's {number} actuators, counted from 0")
+        on_arm("X", X, self.scene.rod.length, self._ends(int(index)), f"thread {index}")
+        return self._thread(int(index), X)
 
     def __repr__(self) -> str:
         if is_traced(self.status) or jnp.ndim(self.status) > 0:
@@ -153,7 +166,22 @@ class Equilibrium(eqx.Module):
         array = jnp.asarray(X, self.inputs.dtype)
         if array.ndim > 1:
             raise ValueError(f"X: got shape {array.shape}, need one abscissa or several in a row")
+        on_arm("X", array, self.scene.rod.length)
         return array
+
+    def _ends(self, index: int) -> tuple[Any, Any]:
+        """Where a thread begins and ends [m]."""
+        actuator = self.scene.actuators[index]
+        start, end = actuator.start, actuator.end
+        return 0.0 if start is None else start, self.scene.rod.length if end is None else end
+
+    def _at(self, X: Array, quantity: Callable[[Array], Array], ends: tuple[Any, Any] | None = None) -> Array:
+        """A quantity at abscissas, in its first axis; NaN beyond the arm, or the ends, and where the solve failed."""
+        length = self.scene.rod.length
+        x, near = onto(X, *((0.0, length) if ends is None else ends), ROUNDING * length)
+        value = quantity(jnp.atleast_1d(x))
+        known = jnp.atleast_1d(near & self.converged).reshape(-1, *(1,) * (value.ndim - 1))
+        return jnp.where(known, value, jnp.nan).reshape(*X.shape, *value.shape[1:])
 
     @eqx.filter_jit
     def _tip(self) -> Pose:
@@ -161,18 +189,19 @@ class Equilibrium(eqx.Module):
 
     @eqx.filter_jit
     def _poses(self, X: Array) -> Array:
-        poses = self.model.poses(self.scene, self._sound_forces, self._state, jnp.atleast_1d(X))
-        return self._mask(poses.reshape(*X.shape, 4, 4))
+        return self._at(X, lambda x: self.model.poses(self.scene, self._sound_forces, self._state, x))
 
     @eqx.filter_jit
     def _thread(self, index: int, X: Array) -> Array:
-        g, path = self._poses(X), self.scene.sections(X).paths[index]
-        return g[..., :3, 3] + g[..., :3, 1] * path.y[..., None] + g[..., :3, 2] * path.z[..., None]
+        def place(x: Array) -> Array:
+            g, path = self._poses(x), self.scene.sections(x).paths[index]
+            return g[:, :3, 3] + g[:, :3, 1] * path.y[:, None] + g[:, :3, 2] * path.z[:, None]
+
+        return self._at(X, place, self._ends(index))
 
     @eqx.filter_jit
     def _strain(self, X: Array) -> Array:
-        strain = self.model.strain(self.scene, self._sound_forces, self._state, jnp.atleast_1d(X))
-        return self._mask(c.join(strain).reshape(*X.shape, 6))
+        return self._at(X, lambda x: c.join(self.model.strain(self.scene, self._sound_forces, self._state, x)))
 
     def _nodes(self) -> Nodes:
         return self.model.nodes(self.scene, self._sound_forces, self._state)
@@ -209,6 +238,4 @@ class Equilibrium(eqx.Module):
     def _reaction(self, X: Array) -> Array:
         nodes = self._nodes()
         loads = loading(self.scene, nodes.grid)
-        if loads is None:
-            return self._mask(jnp.zeros((*X.shape, 6), X.dtype))
-        return self._mask(c.join(react_at(nodes.xi, nodes.grid, loads, X)))
+        return self._at(X, lambda x: jnp.zeros((x.size, 6), x.dtype) if loads is None else c.join(react_at(nodes.xi, nodes.grid, loads, x)))

@@ -16,7 +16,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from . import component as c
-from ._types import Pose, Scalar
+from ._types import Pose, Scalar, cast
 from .balance import solve_balance
 from .component import Vector
 from .coupled import Unknown, imbalance_of, problem_of, state_of
@@ -110,7 +110,7 @@ def _together(model: SteppedModel, scene: Scene, inputs: Array, forces: Vector, 
     def correct(_: Any, unknown: Unknown) -> Unknown:
         at = state_of(unknown, problem, kind)
         step, _ = approximate_solve(unknown, at, imbalance_of(unknown, at, problem, kind), problem, kind)
-        return c.subtract(unknown, step)
+        return c.subtract(unknown, cast(step, xi[0].dtype))
 
     start = Unknown(xi, tuple(-forces[place] for place in kind.cables), turning)
     return lax.fori_loop(0, _PASSES, correct, start).xi

@@ -169,7 +169,7 @@ def _sizes_of(basis: Basis, K: Array, problem: Problem, kind: Kind) -> _Sizes:
     gram = [w * jnp.einsum("ija...,ijb...,ij...->ab...", m, m, grid.weight / length) for m, w in _by_strain(basis.matrix, length)]
     pulls = [jnp.max(pull_of(sections, place, length), axis=(0, 1)) for place in kind.cables]
     axial = jnp.max(sections.stiffness[3], axis=(0, 1))
-    return _Sizes(sum(gram[1:], gram[0]), lu.factor(K), jnp.stack(pulls) if pulls else jnp.zeros((0, *length.shape)), axial)
+    return _Sizes(sum(gram[1:], gram[0]), lu.factor(K), jnp.stack(pulls) if pulls else jnp.zeros((0, *length.shape), K.dtype), axial)
 
 
 def _by_strain(matrix: Array, length: Array) -> list[tuple[Array, Array | float]]:
@@ -203,7 +203,8 @@ def _solve(kind: Kind, basis: Basis, problem: Problem) -> Solution:
         step = Unknown(flat[:size].astype(K.dtype), flat[size:].astype(K.dtype))
         moved = sizes.of_step(step)
         cut = MOST_TURN / jnp.maximum(turn, MOST_TURN)
-        definite = jnp.all(lu.diagonal(factors)[:size] > 0, axis=0)
+        falling = lu.diagonal(factors) <= 0  # taut cables hold as many motions as their own rows have such pivots
+        definite = jnp.sum(falling[:size], axis=0) == jnp.sum(falling[size:], axis=0)
         return Damped(jax.tree.map(lambda x: cut * x, step), moved, r.q, sizes.of_imbalance(r), definite)
 
     def work(force: Array, step: Unknown) -> Array:

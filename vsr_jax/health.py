@@ -20,6 +20,7 @@ from .component import Vector, scale
 from .equilibrium import Equilibrium
 from .load import Frame, Load
 from .model import Model, Status
+from .plausible import strain_warnings, warnings_of
 from .quadrature import make_grid
 from .rod import Rod
 from .scene import Scene
@@ -47,6 +48,7 @@ class Health(NamedTuple):
       its diagonal: 0 where some threads do together what others do, 1 where none knows of another; None for fewer than two.
     - `inputs`, `loads`: how far each may grow, a `Limit`; None where there are none.
     - `tip_change` [m]: by which the tip moves with twice the steps (`Continuum`: with a hundredth of the tolerances).
+    - `warnings`: sentences about implausible numbers.
     """
 
     equilibrium: Equilibrium
@@ -54,6 +56,11 @@ class Health(NamedTuple):
     inputs: Limit | None
     loads: Limit | None
     tip_change: Scalar
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences about numbers that are far outside of what arms have, most often by a slip of unit; none under `jax.jit`."""
+        return (*warnings_of(self.equilibrium.scene), *strain_warnings(self.equilibrium))
 
 
 class _Share(Load):

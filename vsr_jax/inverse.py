@@ -19,7 +19,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from . import box
-from ._check import instance, interval, numbers, positive
+from ._check import instance, interval, numbers, on_arm, positive, rigid
 from ._types import Scalar, cast
 from .equilibrium import Equilibrium
 from .model import Model
@@ -28,6 +28,8 @@ from .se3 import rotation_vector
 from .solve import solve
 
 _TRIED, _STARTS = 512, 6
+_ENOUGH = {"float64": 1e-6, "float32": 1e-3}
+"""Miss, by the length, from which on no other start is tried: at one that is greater there may be a nearer place elsewhere."""
 _BESIDE = 0.1
 """Distance, by the diagonal of the box of shares, within which inputs tried out lead to the same place."""
 
@@ -39,38 +41,42 @@ class Reach(NamedTuple):
     - `equilibrium`: the arm there.
     - `miss` [m]: distance of the points from where they are wanted, the root of the sum of squares; of a pose [m], with the angle
       [rad] times the arm's length.
-    - `reached`: whether that is within the tolerance. If not, this is the nearest found.
+    - `reached`: whether that is at most `allowed_miss`. If not, this is the nearest found.
+    - `allowed_miss` [m]: miss that counts as reached.
     """
 
     inputs: Float[Array, " inputs"]
     equilibrium: Equilibrium
     miss: Scalar
     reached: Bool[Array, ""]
+    allowed_miss: Scalar
 
 
-def reach(scene: Scene, target: Any, bounds: Any, *, X: Any = None, model: Model | None = None, tolerance: float | None = None) -> Reach:
+def reach(scene: Scene, target: Any, bounds: Any, *, X: Any = None, model: Model | None = None, allowed_miss: float | None = None) -> Reach:
     """Inputs within bounds that bring the arm to a target, with the least effort among those that do.
 
     One target at a time; batch with `jax.vmap`. Derivatives of the inputs by the target and by the scene's numbers are implicit.
 
     **Arguments:**
-    - `target`: place of the tip [m], shape (3,); its pose, shape (4, 4); or with `X` the places of points of the axis, shape
-      (points, 3). Its dtype is the precision.
+    - `target`: place of the tip [m], shape (3,); its pose, a rigid transform of shape (4, 4); or with `X` the places of points of the
+      axis, shape (points, 3). Its dtype is the precision.
     - `bounds`: the least and the greatest inputs, a pair of numbers or of arrays with one number an actuator.
-    - `X`: abscissas [m] of the points, shape (points,).
+    - `X`: abscissas [m] of the points on the arm, shape (points,).
     - `model`: as for `solve`.
-    - `tolerance` [m]: miss that counts as reached; a millionth of the length, in single precision a thousandth.
+    - `allowed_miss` [m]: miss that counts as reached; a ten-thousandth of the length, in single precision a thousandth. It decides
+      on `reached` alone: the nearest is found as exactly with any.
 
-    **Raises:** `ValueError` for shapes that do not fit, bounds that contradict each other or an actuator's range, and no actuators.
+    **Raises:** `ValueError` for shapes that do not fit, a pose that is no rigid transform, points beyond the arm, bounds that contradict
+    each other or an actuator's range, and no actuators.
     """
     instance("scene", scene, Scene, "a Scene")
     wanted = numbers("target", target, None)
     places = None if X is None else numbers("X", X, None).astype(wanted.dtype)
-    _check_shapes(wanted, places)
+    _check_target(wanted, places, scene)
     low, high = _check_bounds(scene, bounds, wanted.dtype)
     scene, model, places = cast((scene, model, places), wanted.dtype)
-    share = 1e-6 if wanted.dtype == jnp.float64 else 1e-3
-    allowed = share * scene.rod.length if tolerance is None else jnp.asarray(positive("tolerance", tolerance), wanted.dtype)
+    share = 1e-4 if wanted.dtype == jnp.float64 else 1e-3
+    allowed = share * scene.rod.length if allowed_miss is None else jnp.asarray(positive("allowed_miss", allowed_miss), wanted.dtype)
     return _reach(_Task(scene, wanted, places, low, high, model), allowed)
 
 
@@ -116,11 +122,15 @@ class _Task(NamedTuple):
         return self.misses(self.places(self.at(share))) / self.scene.rod.length
 
 
-def _check_shapes(target: Array, X: Array | None) -> None:
+def _check_target(target: Array, X: Array | None, scene: Scene) -> None:
     if X is None and target.shape not in ((3,), (4, 4)):
         raise ValueError(f"target: got shape {target.shape}, need (3,), a place, or (4, 4), a pose, or with X (points, 3)")
     if X is not None and (X.ndim != 1 or target.shape != (X.size, 3)):
         raise ValueError(f"X: got shape {X.shape} for targets of shape {target.shape}, need (points,) for (points, 3)")
+    if target.shape == (4, 4):
+        rigid("target", target)
+    if X is not None:
+        on_arm("X", X, scene.rod.length)
 
 
 def _check_bounds(scene: Scene, bounds: Any, dtype: Any) -> tuple[Array, Array]:
@@ -139,12 +149,13 @@ def _reach(task: _Task, allowed: Scalar) -> Reach:
     places = jax.vmap(lambda share: task.places(task.at(share)))(tried)  # of the scene alone: under vmap over targets these are solved once
     distance = jax.vmap(lambda x: jnp.linalg.norm(task.misses(x)))(places)
     still = _still(task)
-    found = box.nearest(still.missed, lax.stop_gradient(_starts(tried, distance)), still.idle, allowed / still.scene.rod.length)
+    enough = jnp.minimum(allowed / still.scene.rod.length, _ENOUGH[still.target.dtype.name])
+    found = box.nearest(still.missed, lax.stop_gradient(_starts(tried, distance)), still.idle, enough)
     share = _moving(task, found)
     there = task.at(share)
     miss = jnp.linalg.norm(task.misses(task.places(there)))
     miss = jnp.where(jnp.isfinite(miss), miss, jnp.inf)
-    return Reach(task.inputs(share), there, miss, miss <= allowed)
+    return Reach(task.inputs(share), there, miss, miss <= allowed, allowed)
 
 
 def _starts(tried: Float[Array, "tried inputs"], distance: Float[Array, " tried"]) -> Float[Array, "starts inputs"]:

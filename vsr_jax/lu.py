@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 
-def factor(matrix: Float[Array, "n n *arms"]) -> Float[Array, "n n *arms"]:
+def factor(matrix: Float[Array, "n n *#arms"]) -> Float[Array, "n n *#arms"]:
     """Factors of a matrix in one: U on and above the diagonal, L below it without its ones."""
     place = jnp.arange(matrix.shape[0]).reshape(-1, *(1,) * (matrix.ndim - 2))
 
@@ -23,12 +23,12 @@ def factor(matrix: Float[Array, "n n *arms"]) -> Float[Array, "n n *arms"]:
     return lax.fori_loop(0, matrix.shape[0], eliminate, matrix)
 
 
-def diagonal(factors: Float[Array, "n n *arms"]) -> Float[Array, "n *arms"]:
+def diagonal(factors: Float[Array, "n n *#arms"]) -> Float[Array, "n *#arms"]:
     """Diagonal of U: all positive if and only if all leading minors of the matrix are."""
     return jnp.diagonal(factors, axis1=0, axis2=1).transpose(factors.ndim - 2, *range(factors.ndim - 2))
 
 
-def substitute(factors: Float[Array, "n n *arms"], right: Float[Array, "n *arms"]) -> Float[Array, "n *arms"]:
+def substitute(factors: Float[Array, "n n *#arms"], right: Float[Array, "n *#arms"]) -> Float[Array, "n *#arms"]:
     """Solution of $L U x = b$."""
     size = right.shape[0]
     place = jnp.arange(size).reshape(-1, *(1,) * (right.ndim - 1))
@@ -44,7 +44,7 @@ def substitute(factors: Float[Array, "n n *arms"], right: Float[Array, "n *arms"
     return lax.fori_loop(0, size, backward, lax.fori_loop(0, size, forward, right))
 
 
-def solve(matrix: Float[Array, "n n *arms"], right: Float[Array, "n *arms"]) -> Float[Array, "n *arms"]:
+def solve(matrix: Float[Array, "n n *#arms"], right: Float[Array, "n *#arms"]) -> Float[Array, "n *#arms"]:
     """Solution of $A x = b$, with derivatives of any order in both modes."""
 
     def product(x: Array) -> Array:

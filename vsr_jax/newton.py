@@ -165,7 +165,7 @@ def damped_newton(
             old.plain,
         )
         here = old._replace(damping=damping, fresh=plain)
-        guard = _where(taken, there, here)._replace(spent=old.spent + 1, plain=old.plain + plain)
+        guard = _where(taken, there, here)._replace(spent=old.spent + 1, plain=old.plain + plain.astype(jnp.int32))
         # a step that is not taken is computed again with more damping before it is used, and that of a problem that is done never is
         go = pending(old)
         return _where(go & taken, trial, x), new.step, _where(go, guard, old)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ._check import concrete, instance, numbers, positive
+from ._check import concrete, instance, numbers, on_arm, positive, rigid
 from ._types import Scalar
 from .equilibrium import Equilibrium
 from .model import Model, Outcome
@@ -49,8 +49,8 @@ class Objective(eqx.Module):
     def __call__(self, arms: Arms) -> Scalar:
         """Its value."""
 
-    def check(self, sets: int) -> None:
-        """Refuses what does not fit as many sets of inputs."""
+    def check(self, sets: int, longest: Any) -> None:
+        """Refuses what does not fit as many sets of inputs, or an arm that is no longer than `longest` [m]."""
 
     def __add__(self, other: "Objective") -> "Objective":
         return Sum((self, instance("objective", other, Objective, "another objective to add")))
@@ -69,9 +69,9 @@ class Sum(Objective):
     def __call__(self, arms: Arms) -> Scalar:
         return sum((part(arms) for part in self.parts), start=jnp.zeros((), arms.inputs.dtype))
 
-    def check(self, sets: int) -> None:
+    def check(self, sets: int, longest: Any) -> None:
         for part in self.parts:
-            part.check(sets)
+            part.check(sets, longest)
 
 
 class Weighted(Objective):
@@ -83,8 +83,8 @@ class Weighted(Objective):
     def __call__(self, arms: Arms) -> Scalar:
         return self.factor * self.part(arms)
 
-    def check(self, sets: int) -> None:
-        self.part.check(sets)
+    def check(self, sets: int, longest: Any) -> None:
+        self.part.check(sets, longest)
 
 
 class Measure(Objective):
@@ -108,11 +108,14 @@ class TipError(Objective):
         self.targets = numbers("TipError.targets", targets, None)
         if self.targets.shape[1:] not in ((3,), (4, 4)):
             raise ValueError(f"TipError.targets: got shape {self.targets.shape}, need (sets, 3) or (sets, 4, 4)")
+        if self.targets.ndim == 3:
+            for i, pose in enumerate(self.targets):
+                rigid(f"TipError.targets[{i}]", pose)
 
     def __call__(self, arms: Arms) -> Scalar:
         return jnp.mean(arms.each(_missed, self.targets))
 
-    def check(self, sets: int) -> None:
+    def check(self, sets: int, longest: Any) -> None:
         _one_a_set("TipError.targets", self.targets, sets)
 
 
@@ -132,7 +135,7 @@ class CurveError(Objective):
 
     **Arguments:**
     - `points`: where the axis is wanted [m], shape (points, 3) for all sets or (sets, points, 3).
-    - `X`: abscissas [m] of the points; evenly spaced up to the tip by default, base left out.
+    - `X`: abscissas [m] of the points, on the arm; with `local` beyond its base; evenly spaced up to the tip by default, base left out.
     - `local`: whether points near the base count more.
     """
 
@@ -145,7 +148,7 @@ class CurveError(Objective):
         self.points = numbers("CurveError.points", points, None)
         if self.points.ndim not in (2, 3) or self.points.shape[-1] != 3:
             raise ValueError(f"CurveError.points: got shape {self.points.shape}, need (points, 3) or (sets, points, 3)")
-        self.X = None if X is None else numbers("CurveError.X", X, self.points.shape[-2:-1])
+        self.X = None if X is None else numbers("CurveError.X", X, self.points.shape[-2:-1], least=0.0, positive=local)
 
     def __call__(self, arms: Arms) -> Scalar:
         many, length = self.points.shape[-2], arms.scene.rod.length
@@ -154,9 +157,11 @@ class CurveError(Objective):
         missed = arms.each(lambda eq, wanted: jnp.sum((eq.position(X) - wanted) ** 2, axis=-1), points) / length**2
         return jnp.mean(missed * (length / X) ** 4 if self.local else missed)
 
-    def check(self, sets: int) -> None:
+    def check(self, sets: int, longest: Any) -> None:
         if self.points.ndim == 3:
             _one_a_set("CurveError.points", self.points, sets)
+        if self.X is not None:
+            on_arm("CurveError.X", self.X, longest)
 
 
 class Workspace(Objective):
@@ -178,7 +183,7 @@ class Workspace(Objective):
         spread = jnp.linalg.eigvalsh(off.T @ off / tips.shape[0])[-self.dimensions :]
         return -0.5 * jnp.mean(jnp.log(spread + jnp.finfo(tips.dtype).eps))
 
-    def check(self, sets: int) -> None:
+    def check(self, sets: int, longest: Any) -> None:
         if sets <= self.dimensions:
             raise ValueError(f"Workspace: got {sets} sets of inputs, need more than {self.dimensions} to span so many dimensions")
 

@@ -16,7 +16,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 
-from ._check import choice
+from ._check import choice, on_arm
 from .equilibrium import Equilibrium
 from .rod import STRAINS
 
@@ -57,7 +57,7 @@ def sample(eq: Equilibrium, stations: Any = 60, *, program: Callable | None = No
 
     **Arguments:** `stations`: how many, evenly spaced on the arm, or their abscissas [m]; `program`: what `sampling` compiled.
 
-    **Raises:** `ValueError` for a batch of equilibria and for one that did not converge.
+    **Raises:** `ValueError` for a batch of equilibria, for one that did not converge and for stations beyond the arm.
     """
     if np.ndim(eq.status) > 0:
         raise ValueError(f"eq: got a batch of shape {np.shape(eq.status)}, need one equilibrium")
@@ -75,7 +75,10 @@ def sampling(eq: Equilibrium, stations: Any = 60) -> Callable:
 
 
 def _abscissas(eq: Equilibrium, stations: Any) -> np.ndarray:
-    return np.linspace(0.0, float(eq.scene.rod.length), stations) if isinstance(stations, int) else np.asarray(stations)
+    if isinstance(stations, int | np.integer):
+        return np.linspace(0.0, float(eq.scene.rod.length), stations)
+    on_arm("stations", stations, eq.scene.rod.length)
+    return np.asarray(stations)
 
 
 @eqx.filter_jit

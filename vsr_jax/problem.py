@@ -75,11 +75,11 @@ def posed(
     instance("scene", scene, Scene, "a Scene")
     sets = _sets(scene, inputs)
     wanted = objective if isinstance(objective, Objective) else Measure(_function(objective))
-    wanted.check(sets.shape[0])
     kept = tuple(instance(f"constraints[{i}]", one, Constraint, "a Constraint") for i, one in enumerate(constraints))
     kept = kept if any(isinstance(one, Inside) for one in kept) else (Inside(), *kept)
     known = {name: parameter.value for name, parameter in parameters(scene).items()} | {INPUTS: sets}
     low, high = _bounds(free, known)
+    wanted.check(sets.shape[0], high.get("rod.length", scene.rod.length))
     if INPUTS in low:
         for end in (low[INPUTS], high[INPUTS]):
             for row in np.asarray(end):

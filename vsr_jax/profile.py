@@ -6,6 +6,7 @@ Wherever a profile is expected a plain number means `Constant` and a Python func
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
+from operator import attrgetter
 from typing import Any
 
 import equinox as eqx
@@ -17,6 +18,9 @@ from jaxtyping import Array, Float
 
 from ._check import concrete, numbers
 from ._types import Scalar
+
+Limits = dict[tuple[str, str], tuple[Array, Array]]
+"""Numbers that have limits, by their name and by what is needed of them; each with its room, how far it is inside of them."""
 
 
 class FunctionOfX(eqx.Module):
@@ -219,18 +223,46 @@ class FunctionProfile(Profile):
         return jnp.asarray(self.function(X), X.dtype)
 
 
-def as_profile(name: str, value: Any, *, positive: bool = False) -> Profile:
-    """`value` as a profile: a `Profile` itself, a function of X, or a number."""
+class _Scaled(Profile):
+    """A factor times a profile."""
+
+    factor: float = eqx.field(static=True)
+    profile: Profile
+
+    def __call__(self, X: Scalar, length: Scalar) -> Scalar:
+        return self.factor * self.profile(X, length)
+
+    @property
+    def breakpoints(self) -> tuple[Scalar, ...]:
+        return self.profile.breakpoints
+
+
+def as_profile(name: str, value: Any, **limits: Any) -> Profile:
+    """`value` as a profile: a `Profile` itself, a function of X, or a number; its numbers within `limits`, as for `numbers`."""
     if isinstance(value, Taper):
-        numbers(f"{name} (Taper.base)", value.base, positive=positive)
-        numbers(f"{name} (Taper.tip)", value.tip, positive=positive)
+        numbers(f"{name} (Taper.base)", value.base, **limits)
+        numbers(f"{name} (Taper.tip)", value.tip, **limits)
     if isinstance(value, Constant):
-        numbers(name, value.value, positive=positive)
-    if isinstance(value, Piecewise) and positive:
+        numbers(name, value.value, **limits)
+    if isinstance(value, Piecewise) and limits:
         for i, part in enumerate(value.values):
-            as_profile(f"{name} (Piecewise.values[{i}])", part, positive=True)
+            as_profile(f"{name} (Piecewise.values[{i}])", part, **limits)
     if isinstance(value, Profile):
         return value
     if callable(value):
         return FunctionProfile(value)
-    return Constant(numbers(name, value, positive=positive))
+    return Constant(numbers(name, value, **limits))
+
+
+_LINEAR_IN = {Constant: ("value",), Taper: ("base", "tip"), PolynomialProfile: ("coefficients",), SplineProfile: ("values",)}
+"""The fields that a profile is proportional to."""
+
+
+def scaled(factor: float, profile: Profile) -> Profile:
+    """$c f(X)$, of the same kind as the profile where its own numbers can hold the factor."""
+    if type(profile) is Piecewise:
+        return Piecewise(profile.ends, [scaled(factor, part) for part in profile.values])
+    if type(profile) not in _LINEAR_IN:
+        return _Scaled(factor, profile)
+    fields = attrgetter(*_LINEAR_IN[type(profile)])
+    return eqx.tree_at(fields, profile, replace_fn=lambda number: factor * number)

@@ -64,10 +64,10 @@ def _share(edges: Float[Array, " edges"], steps: int | Array, place: Array) -> t
     whole = jnp.floor(exact)
     order = jnp.argsort(jnp.argsort(whole - exact))
     spare = steps - lengths.size - jnp.sum(whole).astype(int)
-    count = 1 + whole.astype(int) + (order < spare)
+    count = 1 + whole.astype(int) + (order < spare).astype(int)
     last = jnp.cumsum(count)
     piece = jnp.minimum(jnp.searchsorted(last, place, side="right"), lengths.size - 1)
-    return piece, count[piece], place - (last - count)[piece]
+    return piece, count[piece].astype(edges.dtype), place - (last - count)[piece]
 
 
 def interpolation(stages: int) -> np.ndarray:
@@ -114,6 +114,14 @@ def locate(grid: Grid, X: Array) -> tuple[Array, Array]:
     step = jnp.clip(jnp.searchsorted(grid.start, X, side="right") - 1, 0, grid.start.size - 1)
     h = grid.h[step]
     return step, jnp.where(h > 0, (X - grid.start[step]) / jnp.where(h > 0, h, 1.0), 0.0)
+
+
+def onto(X: Array, start: Array | float, end: Array | float, slack: Array) -> tuple[Array, Array]:
+    """Abscissas clipped to [start, end], and whether they lie there or beyond it by `slack` at most. Those farther away become `start`,
+    so that what is computed from them is finite; the derivative of the others is 1."""
+    near = (X - start >= -slack) & (X - end <= slack)
+    x = jnp.where(near, X, start)
+    return x + lax.stop_gradient(jnp.clip(x, start, end) - x), near
 
 
 def within(density: Array, grid: Grid, step: Array, sigma: Array | float) -> Array:

@@ -150,7 +150,7 @@ def react(xi: Vector, grid: Grid, loads: Loading) -> Reaction:
 
 
 def reaction_change(change: Vector, along: Reaction, grid: Grid, loads: Loading) -> Vector:
-    r"""Change $\delta\Lambda$ of the reaction with a small change $(\kappa, \upsilon)$ of the strain, of the order of the nodes' quadrature.
+    r"""Change $\delta\Lambda$ of the reaction with a change $(\kappa, \upsilon)$ of the strain, of the order of the nodes' quadrature.
 
     With the rotation $\theta(X) = \int_0^X R \kappa \, ds$ of the sections in the world frame
 

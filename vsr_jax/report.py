@@ -59,7 +59,7 @@ def record(eq: Equilibrium, samples: Samples | None) -> dict[str, Any]:
 
 
 def health_lines(health: Health, title: str = "") -> list[str]:
-    """The health of a solve in a few lines, the last of them advice."""
+    """The health of a solve in a few lines, the last of them warnings and advice."""
     eq, length = health.equilibrium, float(health.equilibrium.scene.rod.length)
     text = lines(eq, title)[: 3 if title else 2]
     if bool(eq.converged):
@@ -72,6 +72,7 @@ def health_lines(health: Health, title: str = "") -> list[str]:
     text += [f"  {name:12} {_reach(limit)}" for name, limit in (("inputs", health.inputs), ("loads", health.loads)) if limit is not None]
     if health.independence is not None:
         text.append(f"  independence {float(health.independence):.2g} of the threads (0: some do together what others do, 1: each its own)")
+    text += [f"  warning      {sentence}" for sentence in health.warnings]
     return text + [f"  advice       {sentence}" for sentence in _advice(health)]
 
 
@@ -79,7 +80,7 @@ def health_record(health: Health) -> dict[str, Any]:
     """The health of a solve as numbers and texts, with None for what is not known.
 
     **Returns:** `status` in words, `converged`, `margin`, `condition`, `independence`; `inputs` and `loads`, each with the
-    `factor` by which it may grow and what ends it, `then`; `tip_change` [m] by finer steps; `advice`, a list of sentences.
+    `factor` by which it may grow and what ends it, `then`; `tip_change` [m] by finer steps; `warnings` and `advice`, lists of sentences.
     """
     eq = health.equilibrium
 
@@ -98,6 +99,7 @@ def health_record(health: Health) -> dict[str, Any]:
         "inputs": limit(health.inputs),
         "loads": limit(health.loads),
         "tip_change": known(health.tip_change),
+        "warnings": list(health.warnings),
         "advice": _advice(health),
     }
 

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ._check import instance, numbers
+from ._check import instance, numbers, rigid
 from ._types import Pose, Scalar
 from .component import Vector
 from .material import Material
-from .profile import FunctionOfX, Profile, as_profile
+from .profile import FunctionOfX, Limits, Profile, as_profile
 from .section import Section
 
 STRAINS = ("torsion", "bending_y", "bending_z", "elongation", "shear_y", "shear_z")
@@ -28,8 +28,8 @@ class Rod(eqx.Module):
     - `length`: $L$ [m].
     - `section`, `material`: what makes its stiffness, see `Material.stiffness`.
     - `rest_strain`: $\\xi^*(X) = (k^*, u^*)$: six profiles (numbers, `Profile` or functions of X), or one function of X
-      that returns six numbers. The default (0, 0, 0, 1, 0, 0) is straight.
-    - `base`: pose of the section at X = 0, shape (4, 4); the identity by default.
+      that returns six numbers. The default (0, 0, 0, 1, 0, 0) is straight. The elongation $u_x^*$ has to be positive.
+    - `base`: pose of the section at X = 0, a rigid transform of shape (4, 4); the identity by default.
     - `guide_radius`: threads are guided up to this radius [m] by discs wider than the section; by default they run
       inside the section.
     """
@@ -55,7 +55,7 @@ class Rod(eqx.Module):
         self.section = instance("Rod.section", section, Section, "a section such as Circular, Annular, Rectangular or Elliptic")
         self.material = instance("Rod.material", material, Material, "a Material")
         self.rest_strain = _rest_strain(rest_strain)
-        self.base = None if base is None else numbers("Rod.base", base, (4, 4))
+        self.base = None if base is None else rigid("Rod.base", base)
         self.guide_radius = None if guide_radius is None else numbers("Rod.guide_radius", guide_radius, positive=True)
 
     def rest(self, X: Scalar) -> Vector:
@@ -67,6 +67,13 @@ class Rod(eqx.Module):
     def stiffness(self, X: Scalar) -> Vector:
         """Diagonal of $\\Sigma$ at X [m], six scalars [N m^2] and [N]."""
         return self.material.stiffness(self.section, X, self.length)
+
+    def limits(self, X: Scalar) -> Limits:
+        """Sizes, material and rest elongation at X [m] and what they have to keep to."""
+        parts = {"section": self.section.limits(X, self.length), "material": self.material.limits(X, self.length)}
+        found = {(f"{part}.{name}", needed): pair for part, limits in parts.items() for (name, needed), pair in limits.items()}
+        elongation = self.rest(X)[3]
+        return {**found, ("rest_strain (elongation)", "a number > 0, which is 1 at the length of the rod,"): (elongation, elongation)}
 
     def clearance(self, y: Scalar, z: Scalar, X: Scalar) -> Array:
         """How far (y, z) lies inside what guides threads at X: positive inside [m]."""

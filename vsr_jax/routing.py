@@ -90,8 +90,8 @@ class Helix(Routing):
 
     **Arguments:**
     - `radius`: $r$ [m], positive.
-    - `angle` or `pitch`: the angle $\\alpha$ between path and cross-section [rad], or the pitch $p$ [m]; one of the two.
-      With `angle` the pitch follows the radius.
+    - `angle` or `pitch`: the angle $\\alpha$ between path and cross-section [rad], at most $\\pi / 2$, or the pitch $p$ [m]; one of the
+      two. With `angle` the pitch follows the radius.
     - `phase`: $\\phi_0$ [rad].
     - `hand`: `"right"` winds from y towards z along the arm, `"left"` the other way.
     """
@@ -106,7 +106,7 @@ class Helix(Routing):
         if (angle is None) == (pitch is None):
             raise ValueError(f"Helix: got angle={angle!r} and pitch={pitch!r}, need one of the two")
         self.radius = numbers("Helix.radius", radius, positive=True)
-        self.angle = None if angle is None else numbers("Helix.angle", angle, positive=True)
+        self.angle = None if angle is None else numbers("Helix.angle", angle, positive=True, most=1.5708)
         self.pitch = None if pitch is None else numbers("Helix.pitch", pitch, positive=True)
         self.phase = numbers("Helix.phase", phase)
         self.hand = choice("Helix.hand", hand, ("right", "left"))

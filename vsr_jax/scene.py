@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ._check import concrete, instance, is_traced, numbers
+from ._check import ROUNDING, concrete, instance, is_traced, numbers, precise
 from ._types import Scalar, cast
 from .actuator import Actuator, Tendon
 from .component import Vector, add, dot
 from .load import Frame, Gravity, Load
+from .profile import Limits
 from .quadrature import make_grid, piece_edges
 from .rod import STRAINS, Rod
 from .routing import Path, thread_tangent
@@ -48,9 +49,9 @@ class Scene(eqx.Module):
     - `free_strains`: names of the strains that can change, all six by default; the others keep their rest value and the
       solve has the size of those that are left. `("bending_y", "bending_z")` is an inextensible rod without twist and shear.
 
-    **Raises:** `ValueError` if a thread leaves the section (or the rod's `guide_radius`), a size is not positive somewhere,
-    a thread ends or a load acts beyond the arm, or gravity meets a material without density; numbers are looked at only
-    while they are known, not under `jax.jit`.
+    **Raises:** `ValueError` if a thread leaves the section (or the rod's `guide_radius`), a size, a modulus, a density or the rest
+    elongation is not positive somewhere, a tube has no wall or Poisson's ratio is out of its range, a thread ends or a load acts beyond
+    the arm, or gravity meets a material without density; numbers are looked at only while they are known, not under `jax.jit`.
     """
 
     rod: Rod
@@ -185,7 +186,8 @@ class Scene(eqx.Module):
         return _rest_length(self, place)
 
     def astype(self, dtype: Any) -> "Scene":
-        """The same scene with its floating-point numbers in `dtype`."""
+        """The same scene with its floating-point numbers in `dtype`, float32 or float64."""
+        precise("dtype", jnp.zeros((), dtype))
         return cast(self, dtype)
 
     def to_toml(self, inputs: Any = None, title: str = "") -> str:
@@ -202,14 +204,14 @@ class Scene(eqx.Module):
         probe = jax.tree.map(concrete, _probe(self))
         if probe[0] is None:
             return
-        X, sizes, clearances = probe
-        for name, values in sizes.items():
-            if not np.all(values > 0):
-                i = int(np.argmin(values))
-                raise ValueError(f"Scene.rod.section.{name}: got {values[i]:g} m at X = {X[i]:g} m, need a size > 0 everywhere")
+        X, limited, clearances = probe
+        for (name, needed), (values, room) in limited.items():
+            if not np.all(room > 0):
+                i, unit = int(np.argmin(room)), " m" if name.startswith("section") else ""
+                raise ValueError(f"Scene.rod.{name}: got {values[i]:g}{unit} at X = {X[i]:g} m, need {needed} everywhere")
         for i, values in enumerate(clearances):
             j = int(np.argmin(values))
-            if not values[j] > -1e-6 * length:
+            if not values[j] > -ROUNDING * length:
                 raise ValueError(
                     f"Scene.actuators[{i}].routing: the thread lies {-values[j]:.3g} m outside the section at X = {X[j]:g} m; "
                     "need a path inside the section (or give the rod a guide_radius)"
@@ -217,7 +219,7 @@ class Scene(eqx.Module):
 
     def _check_places(self, length: float) -> None:
         """Thread ends and point loads lie on the arm."""
-        beyond = length * (1 + 1e-6)  # single precision may round up
+        beyond = length * (1 + ROUNDING)
         for i, actuator in enumerate(self.actuators):
             for name, x in (("start", actuator.start), ("end", actuator.end)):
                 if x is not None and (float(x) > beyond or (name == "start" and float(x) >= length)):
@@ -242,13 +244,13 @@ def _rest_length(scene: Scene, place: int) -> Scalar:
 
 
 @eqx.filter_jit
-def _probe(scene: Scene) -> tuple[Array, dict[str, Array], list[Array]]:
+def _probe(scene: Scene) -> tuple[Array, Limits, list[Array]]:
+    """Places X [m] along the arm; there, the rod's numbers that have limits, and how far each thread lies inside the section [m]."""
     rod = scene.rod
     X = jnp.linspace(0, 1, 65) * rod.length
-    sizes = {name: jax.vmap(lambda x, f=f: f(x, rod.length))(X) for name, f in rod.section.sizes.items()}
 
     def clearance(actuator: Actuator, x: Scalar) -> Array:
         inside, reach = rod.clearance(*actuator.routing(x), x), actuator.reach(x)
         return inside if reach is None else jnp.where(reach > 0, inside, jnp.inf)
 
-    return X, sizes, [jax.vmap(lambda x, a=a: clearance(a, x))(X) for a in scene.actuators]
+    return X, jax.vmap(rod.limits)(X), [jax.vmap(lambda x, a=a: clearance(a, x))(X) for a in scene.actuators]

@@ -60,6 +60,9 @@ _STORED_AS = {
 }
 """Arguments kept in another attribute than the one of their name."""
 
+_NOT_STORED = ((Circular, "diameter"),)
+"""Arguments that say in another way what is stored under another name."""
+
 _DEFAULTS = {(Rod, "rest_strain"): (0.0, 0.0, 0.0, 1.0, 0.0, 0.0)}
 """What a default of None stands for."""
 
@@ -207,6 +210,8 @@ def at(path: str, message: str) -> str:
 def _arguments(value: Any, path: str) -> dict[str, Any]:
     kind, table = type(value), {}
     for name, parameter in inspect.signature(kind).parameters.items():
+        if (kind, name) in _NOT_STORED:
+            continue
         stored = attrgetter(_STORED_AS.get((kind, name), name))(value)
         if stored is None:
             continue

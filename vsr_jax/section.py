@@ -12,9 +12,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ._check import choice, instance, numbers
+from ._check import choice, concrete, instance, numbers
 from ._types import Scalar
-from .profile import Profile, as_profile, pick, rising_ends
+from .profile import Constant, Limits, Profile, as_profile, pick, rising_ends, scaled
 
 Torsion = Literal["saint_venant", "polar"]
 
@@ -55,6 +55,11 @@ class Section(eqx.Module):
     def sizes(self) -> dict[str, Profile]:
         """The size profiles by name."""
 
+    def limits(self, X: Scalar, length: Scalar) -> Limits:
+        """The sizes at X [m] and what they have to keep to."""
+        sizes = {name: size(X, length) for name, size in self.sizes.items()}
+        return {(name, "a size > 0"): (size, size) for name, size in sizes.items()}
+
     @property
     def breakpoints(self) -> tuple[Scalar, ...]:
         """Abscissas [m] where a size or a derivative of it jumps."""
@@ -73,14 +78,19 @@ def _options(torsion: Torsion, shear_correction: Any) -> tuple[Torsion, Float[Ar
 
 
 class Circular(Section):
-    """Solid disc: $A = \\pi r^2$, $J_y = J_z = \\pi r^4 / 4$, $J_x = \\pi r^4 / 2$."""
+    """Solid disc: $A = \\pi r^2$, $J_y = J_z = \\pi r^4 / 4$, $J_x = \\pi r^4 / 2$.
+
+    **Arguments:** `radius` or `diameter` [m], one of the two; the radius is what is kept.
+    """
 
     radius: Profile
     torsion: Torsion = eqx.field(static=True)
     shear_correction: Float[Array, "2"]
 
-    def __init__(self, radius: Any, *, shear_correction: Any = 1.0):
-        self.radius = _size("Circular", "radius", radius)
+    def __init__(self, radius: Any = None, *, diameter: Any = None, shear_correction: Any = 1.0):
+        if (radius is None) == (diameter is None):
+            raise ValueError(f"Circular: got radius={radius!r} and diameter={diameter!r}, need one of the two")
+        self.radius = scaled(0.5, _size("Circular", "diameter", diameter)) if radius is None else _size("Circular", "radius", radius)
         self.torsion, self.shear_correction = _options("saint_venant", shear_correction)
 
     def geometry(self, X: Scalar, length: Scalar) -> Geometry:
@@ -111,6 +121,10 @@ class Annular(Section):
     def __init__(self, outer: Any, inner: Any, *, shear_correction: Any = 1.0):
         self.outer = _size("Annular", "outer", outer)
         self.inner = _size("Annular", "inner", inner)
+        if isinstance(self.outer, Constant) and isinstance(self.inner, Constant):
+            known = concrete(self.inner.value), concrete(self.outer.value)
+            if known[0] is not None and known[1] is not None and not known[0] < known[1]:
+                raise ValueError(f"Annular.inner: got {known[0]:g} m, need less than the outer radius, {known[1]:g} m")
         self.torsion, self.shear_correction = _options("saint_venant", shear_correction)
 
     def geometry(self, X: Scalar, length: Scalar) -> Geometry:
@@ -128,6 +142,10 @@ class Annular(Section):
     @property
     def sizes(self) -> dict[str, Profile]:
         return {"outer": self.outer, "inner": self.inner}
+
+    def limits(self, X: Scalar, length: Scalar) -> Limits:
+        inner = self.inner(X, length)
+        return {**super().limits(X, length), ("inner", "less than the outer radius"): (inner, self.outer(X, length) - inner)}
 
 
 class Rectangular(Section):
@@ -237,6 +255,13 @@ class Joined(Section):
     @property
     def sizes(self) -> dict[str, Profile]:
         return {f"sections[{i}].{name}": size for i, section in enumerate(self.sections) for name, size in section.sizes.items()}
+
+    def limits(self, X: Scalar, length: Scalar) -> Limits:
+        here, found = pick(X, self.ends, list(range(len(self.sections)))), {}
+        for i, section in enumerate(self.sections):
+            for (name, needed), (value, room) in section.limits(X, length).items():
+                found[f"sections[{i}].{name}", needed] = value, jnp.where(here == i, room, jnp.inf)
+        return found
 
     @property
     def breakpoints(self) -> tuple[Scalar, ...]:
