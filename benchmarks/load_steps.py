@@ -9,10 +9,10 @@ with $W_i$ the loads beyond, as wrenches about the origin of space. A change of 
 $h\,Ad(g_i)\,\delta\xi_i$; so the tangent is known in closed form, to second order in h, and dense. Tendons driven by length add their
 tension as an unknown and $\min(T, s) = 0$ as an equation, with s their slack. Friction takes the shares of the last iterate.
 
-A path is stable if at each of its load steps an arm that creeps in proportion to its stiffness comes back from every small change of
-strain that the taut cables allow: all eigenvalues of the scaled tangent have a positive real part. A step that turns the arm by more than
-`MOST_TURN` is halved, so that the path leads from one equilibrium to its neighbour. It ends where stability is lost: what the arm does
-there is a jump.
+Stability is that of an arm whose curvature and twist creep in proportion to their stiffness, all else in balance: by the eigenvalues of
+the scaled tangent. A path ends where a real one ceases to be positive: there the arm snaps. Pairs of complex ones with a negative
+real part, which only loads without potential can make (follower wrenches, dead moments in space, friction), are flutter. A step that
+turns the arm by more than `MOST_TURN` is halved, so that the path leads from one equilibrium to its neighbour.
 """
 
 from typing import Any, NamedTuple
@@ -28,20 +28,26 @@ BALANCED = 1e-7
 """Energy norm of a Newton step that counts as rounding, in $\\sqrt{EI / L}$."""
 
 
+class Margin(NamedTuple):
+    """Least real eigenvalue of the scaled tangent, and least real part of all: 1 at rest."""
+
+    real: float
+    all: float
+
+
 class Path(NamedTuple):
-    """Where a path ended: the share of loads and inputs reached, stability margin there and the least on the way, tip [1 / L], how far the
-    arm is bent in all [rad], and its strains."""
+    """Where a path ended: the share of loads and inputs reached, stability margin there, the least real one on the way, and strains and
+    tensions of the cables."""
 
     share: float
-    margin: float
+    margin: Margin
     least: float
-    tip: np.ndarray
-    turn: float
     strain: np.ndarray
+    tension: np.ndarray
 
     @property
-    def stable(self) -> bool:
-        """Whether all of the loads are carried, by equilibria that are stable."""
+    def arrived(self) -> bool:
+        """Whether all of the loads are carried without a snap on the way."""
         return self.share == 1 and self.least > 0
 
 
@@ -126,8 +132,8 @@ class Arm:
             ends[i + 1] = ends[i] @ step
         return ends, ends[:-1] @ half
 
-    def system(self, xi: np.ndarray, tension: np.ndarray, s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Residual (6 N + cables), its derivative, and which cables are taut."""
+    def system(self, xi: np.ndarray, tension: np.ndarray, s: float) -> tuple[np.ndarray, np.ndarray]:
+        """Residual (6 N + cables) and its derivative."""
         N, h = self.count, self.h
         ends, middle = self.poses(xi)
         A = _adjoint(middle)
@@ -156,20 +162,20 @@ class Arm:
             J[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = H[k]
         r, J = h * r.reshape(-1), h * J
         if rows:
-            slack, by_strain, by_tension, taut = (np.array(x) for x in zip(*rows, strict=True))
-            return np.append(r, slack), np.block([[J, np.array(columns).T], [by_strain, np.diag(by_tension)]]), taut
-        return r, J, np.zeros(0, bool)
+            slack, by_strain, by_tension = (np.array(x) for x in zip(*rows, strict=True))
+            return np.append(r, slack), np.block([[J, np.array(columns).T], [by_strain, np.diag(by_tension)]])
+        return r, J
 
     def _cable(self, i: int, T: float, s: float, share: np.ndarray, size: np.ndarray, B: np.ndarray) -> tuple:
-        """Equation of a cable, its derivative by the strain and by its tension, and whether it is taut."""
+        """Equation of a cable, and its derivatives by the strain and by its tension."""
         reach, given = self.reach[i], self.rest_length[i] + s * self.inputs[i]
         mean = np.sum(share) / np.sum(reach)
         slack = given * (1 + T * mean * self.compliance[i]) - np.sum(self.h * reach * size)
         scale = self.stiffness[0, 3]
         if scale * slack >= T:
-            return T, np.zeros(6 * self.count), 1.0, False
+            return T, np.zeros(6 * self.count), 1.0
         by_strain = -(self.h * reach[:, None] * B).reshape(-1)
-        return scale * slack, scale * by_strain, scale * given * mean * self.compliance[i], True
+        return scale * slack, scale * by_strain, scale * given * mean * self.compliance[i]
 
     def _share(self, t: np.ndarray, middle: np.ndarray, i: int) -> np.ndarray:
         """Share of a tendon's force at the middle of each element, after the capstan equation."""
@@ -199,28 +205,25 @@ class Arm:
         C, diagonal = (np.tensordot(b, D, 1) for b in (self.beyond, self.beyond**2))
         return W, _turned(W), C, diagonal
 
-    def margin(self, J: np.ndarray, taut: np.ndarray) -> float:
-        """Least real part of the eigenvalues of the scaled tangent, in the changes of strain that taut cables allow."""
-        size = 6 * self.count
-        root = np.sqrt(self.h * self.stiffness.reshape(-1))
-        K = J[:size, :size] / (root[:, None] * root)
-        stiff = np.flatnonzero(taut & (np.diag(J)[size:] == 0)) + size
-        soft = np.flatnonzero(taut & (np.diag(J)[size:] != 0)) + size
-        for i in soft:  # an elastic cable is a spring
-            K -= np.outer(J[:size, i] / root, J[i, :size] / root) / J[i, i]
-        if stiff.size:
-            pull, row = J[:size, stiff] / root[:, None], J[stiff, :size] / root
-            Z = np.linalg.qr(row.T, mode="complete")[0][:, stiff.size :]
-            K = Z.T @ (K - pull @ np.linalg.solve(row @ pull, row @ K)) @ Z
+    def margin(self, J: np.ndarray) -> Margin:
+        """Stability from the tangent by curvature and twist, with all else in balance."""
+        bent = np.arange(6 * self.count).reshape(-1, 6)[:, :3].reshape(-1)
+        others = np.setdiff1d(np.arange(len(J)), bent)
+        K = J[np.ix_(bent, bent)] - J[np.ix_(bent, others)] @ np.linalg.solve(J[np.ix_(others, others)], J[np.ix_(others, bent)])
+        root = np.sqrt(self.h * self.stiffness[:, :3].reshape(-1))
+        K = K / (root[:, None] * root)
         least = np.linalg.eigvalsh(0.5 * (K + K.T))[0]
-        return float(least if least > 0 else np.min(np.linalg.eigvals(K).real))
+        if least > 0:  # then so are the real parts of all
+            return Margin(float(least), float(least))
+        values = np.linalg.eigvals(K)
+        return Margin(float(np.min(values.real[values.imag == 0], initial=1.0)), float(np.min(values.real)))
 
-    def balance(self, xi: np.ndarray, tension: np.ndarray, s: float) -> tuple[np.ndarray, np.ndarray, float] | None:
+    def balance(self, xi: np.ndarray, tension: np.ndarray, s: float) -> tuple[np.ndarray, np.ndarray, Margin] | None:
         """Strains, tensions and stability margin of the equilibrium near a start; None if Newton's method does not get there."""
         size = 6 * self.count
         weight = np.sqrt(self.h * self.stiffness)
         for _ in range(MOST_ITERATIONS):
-            r, J, taut = self.system(xi, tension, s)
+            r, J = self.system(xi, tension, s)
             if not np.all(np.isfinite(r)):
                 return None
             try:
@@ -232,29 +235,33 @@ class Arm:
                 return None
             xi, tension = xi - move, tension - step[size:]
             if np.linalg.norm(weight * move) < BALANCED:
-                return xi, tension, self.margin(J, taut)
+                return xi, tension, self.margin(J)
         return None
 
     def follow(self) -> Path:
         """Load steps from rest to all of the loads and inputs, or as far as they lead."""
         xi, tension = self.rest.copy(), np.zeros(len(self.driven))
-        s, step, margin, least, last = 0.0, FIRST_STEP, 1.0, 1.0, (xi, tension, 0.0)
+        s, step, margin, least, last = 0.0, FIRST_STEP, Margin(1.0, 1.0), 1.0, (xi, tension, 0.0)
         while s < 1 and least > 0 and step > LEAST_STEP:
             there = min(1.0, s + step)
             ahead = (there - s) / (s - last[2]) if s > 0 else 0.0
             found = self.balance(xi + ahead * (xi - last[0]), tension + ahead * (tension - last[1]), there)
-            if found is None or np.sum(np.abs(found[0] - xi)[:, :3]) * self.h > MOST_TURN:
-                step /= 2
-                continue
-            if found[2] <= 0 and step > 2 * LEAST_STEP:
+            far = found is None or np.sum(np.abs(found[0] - xi)[:, :3]) * self.h > MOST_TURN
+            if found is None or far or (found[2].real <= 0 and step > 2 * LEAST_STEP):
                 step /= 2
                 continue
             last = (xi, tension, s)
             (xi, tension, margin), s, step = found, there, 1.5 * step
-            least = min(least, margin)
-        ends, _ = self.poses(xi)
-        turn = np.sum(np.linalg.norm((xi - self.rest)[:, 1:3], axis=1)) * self.h
-        return Path(s, margin, least, ends[-1, :3, 3], float(turn), xi)
+            least = min(least, margin.real)
+        return Path(s, margin, least, xi, tension)
+
+    def tip(self, xi: np.ndarray) -> np.ndarray:
+        """Position of the tip [1 / L]."""
+        return self.poses(xi)[0][-1, :3, 3]
+
+    def turn(self, xi: np.ndarray) -> float:
+        """How far the arm is bent in all [rad]."""
+        return float(np.sum(np.linalg.norm((xi - self.rest)[:, 1:3], axis=1)) * self.h)
 
 
 def _lower(count: int) -> np.ndarray:

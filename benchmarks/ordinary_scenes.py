@@ -1,12 +1,12 @@
 """Scenes of an ordinary size, drawn at random: what a solver should never refuse while they have a stable equilibrium.
 
-A `Structure` says what a scene has: tendons (by tension or length, elastic or not, with friction, ending on the way) and loads. It is
-static: all draws of a structure are solved by one compiled program. A draw is a dictionary of numbers in SI units, each a float or a list, that
-`built` turns into a scene and its inputs; a copy of the dictionary is all that a test needs.
+A `Structure` says what a scene has: tendons (by tension or length, elastic or not, with friction, ending on the way) and loads. It
+is static: all draws of a structure are solved by one compiled program. A draw is a dictionary of numbers in SI units, each a float or
+a list, that `built` turns into a scene and its inputs; a copy of the dictionary is all that a test needs.
 
 Sizes: $L / r$ from 10 to 3000; taper to half the radius; curved at rest in half of the draws; weight $\\rho g A L^3 / EI$ up to 30 in
-any direction; forces up to $10\\,EI / L^2$, moments up to $5\\,EI / L$; tendons at 0.2 to 0.9 of the guide radius that together bend the arm
-by about half a turn.
+any direction; forces up to $10\\,EI / L^2$, moments up to $5\\,EI / L$; tendons at 0.2 to 0.9 of the guide radius that together bend
+the arm by about half a turn.
 """
 
 from collections.abc import Callable
