@@ -83,11 +83,13 @@ class Arm:
         ends = [n["end"][i] / L if laid.ends else 1.0 for i, laid in enumerate(tendons)]
         self.reach = [np.clip(end * self.count - np.arange(self.count), 0, 1) for end in ends]
         self.driven = [i for i, laid in enumerate(tendons) if laid.control == "length"]
-        unit = [L if laid.control == "length" else bending / L**2 for laid in tendons]
+        force = bending / L**2
+        units = {"length": L, "tension": force, "pressure": -force / n.get("area", 1.0)}
+        unit = [units[laid.control] for laid in tendons]
         self.inputs = n["inputs"] / np.array(unit) if tendons else np.zeros(0)
         signs = {"pull": 1.0, "release": -1.0, None: 0.0}
         self.friction = [signs[laid.motion] * n["friction"][i] if laid.motion else 0.0 for i, laid in enumerate(tendons)]
-        self.compliance = [bending / L**2 / n["stiffness"][i] if laid.elastic else 0.0 for i, laid in enumerate(tendons)]
+        self.compliance = [force / n["stiffness"][i] if laid.elastic else 0.0 for i, laid in enumerate(tendons)]
         self.rest_length = [np.sum(self.h * self.reach[i] * self._tangent(self.rest, i)[1]) for i in range(len(tendons))]
 
     def _wrenches(self, structure: Any, n: dict[str, Any], L: Any, bending: Any, area: np.ndarray) -> None:

@@ -28,9 +28,9 @@ COLLAPSE_SHARE = 0.2
 
 
 class Laid(NamedTuple):
-    """A tendon of a structure: how it is driven, whether it is elastic, rubs, winds or ends before the tip."""
+    """A tendon of a structure, or a chamber: how it is driven, whether it is elastic, rubs, winds or ends before the tip."""
 
-    control: Literal["tension", "length"] = "tension"
+    control: Literal["tension", "length", "pressure"] = "tension"
     elastic: bool = False
     motion: Literal["pull", "release"] | None = None
     winds: bool = False
@@ -60,6 +60,9 @@ def built(structure: Structure, numbers: Numbers, share: Any = 1.0) -> tuple[vsr
     tendons = []
     for i, laid in enumerate(structure.tendons):
         path = vsr.Helix(n["place"][i], pitch=n["length"] / n["turns"][i], phase=n["phase"][i])
+        if laid.control == "pressure":
+            tendons.append(vsr.Chamber(path, area=n["area"]))
+            continue
         tendons.append(
             vsr.Tendon(
                 path,
@@ -162,6 +165,28 @@ def catheter(structure: Structure, random: np.random.Generator) -> Numbers:
     )
 
 
+def upright(structure: Structure, random: np.random.Generator) -> Numbers:
+    """A silicone arm upright under its weight, from half to some times what its modulus can bear, its chamber at no pressure."""
+    gravity = np.array([-9.81, 0.0, 0.0])
+    return plain(
+        {
+            "length": 0.3,
+            "radius": 0.010,
+            "tip_radius": 0.004,
+            "young": 10 ** random.uniform(5.5, 6.2),
+            "poisson": 0.45,
+            "guide_radius": 0.010,
+            "curvature": np.zeros(2),
+            "gravity": gravity,
+            "place": np.full(1, 0.003),
+            "phase": np.full(1, random.uniform(0, 2 * np.pi)),
+            "turns": np.full(1, PARALLEL),
+            "area": 1e-5,
+            "inputs": np.zeros(1),
+        }
+    )
+
+
 def _direction(random: np.random.Generator) -> np.ndarray:
     vector = random.normal(size=3)
     return vector / np.linalg.norm(vector)
@@ -177,6 +202,7 @@ TENSION, WOUND, LENGTH = Laid(), Laid(winds=True), Laid("length")
 STRUCTURES = {
     "tip wrench and gravity": Structure((), True, ("tip world",)),
     "catheter": Structure((TENSION,) * 4, False, ("tip world",), catheter),
+    "upright, chamber at rest": Structure((Laid("pressure"),), True, (), upright),
     "follower wrenches": Structure((), True, ("tip body", "spread body")),
     "dead wrenches, three tendons": Structure((TENSION, WOUND, Laid(ends=True)), True, ("point world", "spread world")),
     "nine tendons": Structure((TENSION, WOUND, Laid(ends=True)) * 3, True, ("tip body",)),
