@@ -23,7 +23,8 @@ ELEMENTS = 48
 MOST_TURN = 0.6
 """How far [rad] one load step may turn the arm in all."""
 FIRST_STEP, LEAST_STEP = 0.1, 2e-4
-MOST_ITERATIONS = 25
+MOST_ITERATIONS = 25, 100
+"""Without friction, and with it, whose shares converge more slowly."""
 BALANCED = 1e-7
 """Energy norm of a Newton step that counts as rounding, in $\\sqrt{EI / L}$."""
 
@@ -224,7 +225,7 @@ class Arm:
         """Strains, tensions and stability margin of the equilibrium near a start; None if Newton's method does not get there."""
         size = 6 * self.count
         weight = np.sqrt(self.h * self.stiffness)
-        for _ in range(MOST_ITERATIONS):
+        for _ in range(MOST_ITERATIONS[any(self.friction)]):
             r, J = self.system(xi, tension, s)
             if not np.all(np.isfinite(r)):
                 return None

@@ -79,7 +79,7 @@ def built(structure: Structure, numbers: Numbers, share: Any = 1.0) -> tuple[vsr
 def _loads(structure: Structure, n: Numbers, share: Any) -> list[Any]:
     loads: list[Any] = [vsr.Gravity(share * n["gravity"])] if structure.gravity else []
     for name in structure.wrenches:
-        kind, frame = name.split()
+        kind, frame = name.split()[0], "body" if name.endswith("body") else "world"
         force, moment = share * n[f"{name} force"], share * n[f"{name} moment"]
         if kind == "tip":
             loads.append(vsr.TipWrench(force, moment, frame))
