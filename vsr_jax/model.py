@@ -140,7 +140,8 @@ class SteppedModel(Model):
 
     def step_error(self, scene: Scene, forces: Vector, state: Any) -> Scalar:
         nodes = self.nodes(scene, forces, state)
-        return step_error(nodes.xi, nodes.sections, forces, nodes.grid, loaded=bool(scene.loads))
+        sections = nodes.sections._replace(reach=nodes.shares)  # friction takes of a thread's force, no load does
+        return step_error(nodes.xi, sections, forces, nodes.grid, loaded=bool(scene.loads))
 
     @abstractmethod
     def node_strain(self, scene: Scene, state: Any) -> Vector:
