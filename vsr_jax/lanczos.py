@@ -7,6 +7,7 @@ Every new vector is made orthogonal to all before it. There is no call of LAPACK
 """
 
 from abc import abstractmethod
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -217,6 +218,7 @@ def _solve(operator: Operator, value: Array, v: Array, sign: float, right: Array
     return jnp.where(found, x, jnp.nan)
 
 
+@partial(extreme_pairs.defjvp, symbolic_zeros=True)
 def _extreme_pairs_jvp(primals: tuple, tangents: tuple) -> tuple[Pairs, Pairs]:
     (operator,) = primals
     pairs = extreme_pairs(operator)
@@ -226,6 +228,3 @@ def _extreme_pairs_jvp(primals: tuple, tangents: tuple) -> tuple[Pairs, Pairs]:
         values.append(jnp.sum(v * product))
         vectors.append(moved - _solve(operator, value, v, sign, product))
     return pairs, Pairs(jnp.stack(values), jnp.stack(vectors))
-
-
-extreme_pairs.defjvp(_extreme_pairs_jvp, symbolic_zeros=True)

@@ -3,7 +3,7 @@
 from abc import abstractmethod
 from dataclasses import replace
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -77,7 +77,13 @@ class Outcome(NamedTuple):
 
 
 class Model(eqx.Module):
-    """A way to find and to describe the equilibrium of a scene."""
+    """A way to find and to describe the equilibrium of a scene.
+
+    `balanced_everywhere` says whether the balance of the cross-section (eq. 21) holds wherever `strain` is asked for, to rounding or
+    the model's tolerances. Then derivatives and errors may be taken from the balance instead of from `solve`.
+    """
+
+    balanced_everywhere: ClassVar[bool] = False
 
     @abstractmethod
     def solve(self, scene: Scene, inputs: Float[Array, " inputs"]) -> Outcome:

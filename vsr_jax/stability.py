@@ -10,6 +10,7 @@ where c and f are the densities that follow the arm. The product with the tangen
 derivative of the discrete residual: $\theta$ is that of the Magnus steps.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -31,19 +32,18 @@ from .scene import CrossSections, Scene
 from .se3 import exp_coefficients, rotation_components
 
 
-def extremes(scene: Scene, forces: Vector, nodes: Nodes) -> tuple[Array, Array]:
-    r"""Least and greatest eigenvalue of $\Sigma^{-1/2} H \Sigma^{-1/2}$: of each node alone, or of all together where they are coupled.
+def extreme(scene: Scene, forces: Vector, nodes: Nodes, *, greatest: bool = False) -> Array:
+    r"""Least eigenvalue of $\Sigma^{-1/2} H \Sigma^{-1/2}$, or the greatest: of each node alone, or with loads of all together.
 
-    Coupled, they are those of the symmetric part of the whole tangent among the changes of strain that the taut cables allow; NaN
-    where they are not found.
+    Coupled, it is that of the symmetric part of the whole tangent among the changes of strain that the taut cables allow; NaN where it
+    is not found. Without loads cables do not count: they are finitely many, and no number of them stiffens every section.
     """
-    if not scene.loads:
-        lower = chosen_rows(tangent(nodes.xi, nodes.sections, nodes.tau(forces)), scene.free)
-        root = jnp.sqrt(c.join(chosen(nodes.sections.stiffness, scene.free)))
-        scaled = c.join_matrix(c.symmetric(lower)) / (root[..., :, None] * root[..., None, :])
-        values = jnp.linalg.eigvalsh(scaled)
-        return jnp.min(values), jnp.max(values)
-    return _extremes(arm_of(scene, forces, nodes))
+    if scene.loads:
+        return _extreme(arm_of(scene, forces, nodes), -1 if greatest else 0)
+    lower = chosen_rows(tangent(nodes.xi, nodes.sections, nodes.tau(forces)), scene.free)
+    root = jnp.sqrt(c.join(chosen(nodes.sections.stiffness, scene.free)))
+    values = jnp.linalg.eigvalsh(c.join_matrix(c.symmetric(lower)) / (root[..., :, None] * root[..., None, :]))
+    return jnp.max(values) if greatest else jnp.min(values)
 
 
 class Arm(eqx.Module):
@@ -76,20 +76,15 @@ class Arm(eqx.Module):
         return jnp.sum(self.grid.weight * c.dot(x, jax.jvp(imbalance, (self.xi,), (x,))[1]))
 
 
-@jax.custom_jvp
-def _extremes(arm: Arm) -> tuple[Array, Array]:
-    least, greatest = extreme_pairs(arm.tangent()).values
-    return least, greatest
+@partial(jax.custom_jvp, nondiff_argnums=(1,))
+def _extreme(arm: Arm, place: int) -> Array:
+    return extreme_pairs(arm.tangent()).values[place]
 
 
-def _extremes_jvp(primals: tuple[Arm], tangents: tuple[Arm]) -> tuple[tuple[Array, Array], tuple[Array, ...]]:
+@partial(_extreme.defjvp, symbolic_zeros=True)
+def _extreme_jvp(place: int, primals: tuple[Arm], tangents: tuple[Arm]) -> tuple[Array, Array]:
     values, vectors = extreme_pairs(primals[0].tangent())
-    # one by one: under vmap XLA takes twice as long to compile
-    changes = tuple(change_of(lambda arm, v=v: arm.form(v), primals, tangents) for v in vectors)
-    return (values[0], values[1]), changes
-
-
-_extremes.defjvp(_extremes_jvp, symbolic_zeros=True)
+    return values[place], change_of(lambda arm: arm.form(vectors[place]), primals, tangents)
 
 
 class _Following(NamedTuple):
