@@ -3,7 +3,7 @@
     python benchmarks/bench_stability.py [--json FILE] [--rounds N]
 
 Two sections, eight tendons, gravity and a force on the tip, all in turn in one run. "dense" differentiates the residual by every strain
-and asks LAPACK for all eigenvalues; it is given no nodes on pieces without length, where it has 0 / 0. "gradient" is that of the margin
+and computes all eigenvalues by LAPACK, without nodes on pieces without length, where it has 0 / 0. "gradient" is that of the margin
 by the tensions, through the solve.
 """
 

@@ -63,7 +63,7 @@ class _Basis(NamedTuple):
     alpha: Array
     beta: Array
     following: Array
-    count: Array
+    filled: Array
     values: Array
     s: Array
     residual: Array
@@ -86,7 +86,7 @@ def extreme_pairs(operator: Operator) -> Pairs:
         return basis.residual > jnp.array([least, greatest], start.dtype) * jnp.maximum(1, jnp.abs(basis.values))
 
     def proceed(basis: _Basis) -> Array:
-        return (basis.count < basis.alpha.size) & jnp.any(unsettled(basis, eps**0.6, eps**0.4))
+        return (basis.filled < basis.alpha.size) & jnp.any(unsettled(basis, eps**0.6, eps**0.4))
 
     def extend(basis: _Basis) -> _Basis:
         return _with_ritz(lax.fori_loop(0, _BETWEEN, lambda _, basis: _one_more(operator, basis), basis))
@@ -117,7 +117,7 @@ def _empty(start: Array) -> _Basis:
 
 def _one_more(operator: Operator, basis: _Basis) -> _Basis:
     """One product. Once the basis spans an invariant space the vectors are zero, and T goes on with an entry from inside its spectrum."""
-    v, j = basis.following, basis.count
+    v, j = basis.following, basis.filled
     rows = basis.rows.at[j].set(v)
     w = operator.times(v.reshape(operator.like.shape)).reshape(-1)
     parts = rows @ w
@@ -128,17 +128,17 @@ def _one_more(operator: Operator, basis: _Basis) -> _Basis:
     more = size > 64 * jnp.finfo(w.dtype).eps * jnp.max(jnp.abs(alpha))
     beta = basis.beta.at[j].set(jnp.where(more, size, 0.0))
     following = jnp.where(more, w / jnp.where(more, size, 1.0), 0.0)
-    return basis._replace(rows=rows, alpha=alpha, beta=beta, following=following, count=j + 1)
+    return basis._replace(rows=rows, alpha=alpha, beta=beta, following=following, filled=j + 1)
 
 
 def _with_ritz(basis: _Basis) -> _Basis:
     """The ends of the spectrum of T, with their vectors and residuals."""
-    filled = jnp.arange(basis.alpha.size) < basis.count
+    filled = jnp.arange(basis.alpha.size) < basis.filled
     alpha = jnp.where(filled, basis.alpha, basis.alpha[0])  # lies inside the spectrum, and beta is 0 there
-    link = jnp.where(jnp.arange(basis.alpha.size) < basis.count - 1, basis.beta, 0.0)
-    values = _ends(alpha, link, basis.count)
+    link = jnp.where(jnp.arange(basis.alpha.size) < basis.filled - 1, basis.beta, 0.0)
+    values = _ends(alpha, link, basis.filled)
     s = jax.vmap(lambda x: _vector(alpha, link, x))(values)
-    return basis._replace(values=values, s=s, residual=basis.beta[basis.count - 1] * jnp.abs(s[:, basis.count - 1]))
+    return basis._replace(values=values, s=s, residual=basis.beta[basis.filled - 1] * jnp.abs(s[:, basis.filled - 1]))
 
 
 def _pivots(alpha: Array, link: Array, x: Array) -> Array:
@@ -211,7 +211,7 @@ def _solve(operator: Operator, value: Array, v: Array, sign: float, right: Array
         inside = project(x)
         return sign * project(operator.times(inside) - value * inside) + x - inside
 
-    eps, right = jnp.finfo(right.dtype).eps, sign * project(right)
+    eps, right = float(jnp.finfo(right.dtype).eps), sign * project(right)
     x, _ = cg(definite, right, tol=eps**0.8, maxiter=1000)
     left = definite(x) - right
     found = jnp.sum(left**2) <= eps * jnp.sum(right**2)
