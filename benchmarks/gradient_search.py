@@ -82,7 +82,7 @@ def structures(number: int) -> list[Structure]:
         chosen = {name for name, on in zip(EFFECTS, random.random(len(EFFECTS)) < 0.5, strict=True) if on}
         return frozenset(chosen | {NEEDS[name] for name in chosen & set(NEEDS)})
 
-    found = [frozenset(EFFECTS)]
+    found: list[frozenset[str]] = [frozenset(EFFECTS)]
     while len(found) < number:
         seen |= triples(found[-1])
         found.append(max((candidate() for _ in range(100)), key=lambda effects: len(triples(effects) - seen)))
@@ -233,14 +233,14 @@ def search(made: Structure, draws: int, model: Any = None) -> list[Found]:
 
 def difference(odd: np.ndarray, steps: np.ndarray) -> tuple[float, float]:
     r"""Fourth-order central difference $(8 (f_h - f_{-h}) - (f_{2h} - f_{-2h})) / 12 h$ and its error, from $f_h - f_{-h}$ at steps that
-    are halved: where it differs least from those of twice and of half the step, and by how much it differs there."""
+    are halved: where it differs least from those of twice and of half the step, and four times what it differs by there."""
     slopes = (8 * odd[1:] - odd[:-1]) / (12 * steps[1:])
     changes = np.abs(np.diff(slopes))
     errors = np.maximum(changes[1:], changes[:-1])
     if np.all(np.isnan(errors)):
         return float("nan"), float("nan")
     best = int(np.nanargmin(errors))
-    return float(slopes[best + 1]), float(errors[best])
+    return float(slopes[best + 1]), 4 * float(errors[best])
 
 
 def verdict(found: Found) -> str:
