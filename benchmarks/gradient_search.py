@@ -119,7 +119,7 @@ def drawn(made: Structure, random: np.random.Generator) -> Drawn:
     pose = vsr.se3.exp(jnp.asarray([*uniform(-1, 1, 3), *uniform(-0.1, 0.1, 3)]))
     rod = vsr.Rod(L, section, material, rest_strain=rest, base=pose)
     arm = _Arm(L, 0.7 * base, EI)
-    threads = [_tendon(made, i, arm, random) for i in range(2)]
+    threads: list[tuple[Any, float]] = [_tendon(made, i, arm, random) for i in range(2)]
     if "chamber" in on:
         y, z = uniform(0.2, 0.6, 2) * arm.radius * random.choice([-1, 1], 2)
         area = np.pi * (uniform(0.1, 0.3) * arm.radius) ** 2
