@@ -35,6 +35,28 @@ def test_tip_error_of_one_step_and_of_an_arm_in_pieces():
         honest(float(eq.error.tip), tip_distance(eq, vsr.solve(scene, [1.0], model=vsr.StrainDependent(64))))
 
 
+class Softened(vsr.StrainDependent):
+    """A model of somebody else's that finds a hundredth too little strain, and says that it is approximate."""
+
+    balanced_everywhere = False
+
+    def solve(self, scene, inputs):
+        outcome = super().solve(scene, 0.99 * inputs)
+        return outcome._replace(forces=scene.forces(inputs))
+
+    def strain(self, scene, forces, state, X):
+        return super().strain(scene, tuple(0.99 * force for force in forces), state, X)
+
+
+def test_a_model_that_is_not_balanced_is_not_taken_for_one_that_is():
+    """Its strain is compared with one in balance; as that of a `StrainDependent` it was called exact."""
+    eq, exact = (vsr.solve(HELICES, PULL, model=model) for model in (Softened(16), vsr.StrainDependent(16)))
+    X = jnp.linspace(0.01, 0.7, 9)
+    wrong = np.max(np.abs(np.asarray(eq.strain(X) - exact.strain(X))), axis=0)
+    assert np.all(wrong <= np.asarray(eq.error.strain))
+    honest(float(eq.error.tip), tip_distance(eq, exact))
+
+
 def test_errors_against_the_independent_reference():
     entry = paper.reference("B2")[0]
     eq = vsr.solve(HELICES, entry.tau, model=vsr.StrainDependent(12))

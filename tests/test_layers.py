@@ -11,10 +11,10 @@ FOLDER = pathlib.Path(vsr_jax.__file__).parent
 LAYERS = """
 _types _check bounded box fingerprint component implicit se3 quadrature profile section material routing actuator rod load scene
 parameters newton lu batching balance kinematics resolution cable reaction elimination friction coupled coupled_tangent coupled_solve
-basis model galerkin discrete strain_dependent estimate shooting continuum stability equilibrium plausible plan solve inverse sensitivity
-objective constraint descent problem checkpoint optimize health continuation parallel labels archive sweep scenefile designfile plot film
-annotate plot_design paper paper_figures reproduce report timing effects accuracy accuracy_figures cli_common cli_scene cli_sweep
-cli_inverse cli_design cli_studies cli
+basis model galerkin discrete strain_dependent estimate shooting continuum lanczos stability equilibrium plausible plan solve inverse
+sensitivity objective constraint descent problem checkpoint optimize health continuation parallel labels archive sweep scenefile
+designfile plot film annotate plot_design paper paper_figures reproduce report timing effects accuracy accuracy_figures cli_common
+cli_scene cli_sweep cli_inverse cli_design cli_studies cli
 """.split()  # noqa: SIM905
 
 

@@ -46,6 +46,18 @@ OBJECTIVES = {
 }
 
 
+def test_a_thread_that_starts_on_the_axis_moves():
+    """There the distance to the axis has no derivative, and Inside had the slope NaN."""
+    start = vsr.Scene(arm().rod, [vsr.Tendon(vsr.Parallel(0.0, 0.0))])
+    aim = vsr.solve(vsr.Scene(arm().rod, [vsr.Tendon(vsr.Parallel(0.003, 0.002))]), [2.0], model=MODEL).tip[:3, 3]
+    free = {f"actuators[0].routing.{axis}": (-0.008, 0.008) for axis in "yz"}
+    settings = {"model": MODEL, "starts": 1, "steps": 60, "tried": 1, "progress": False}
+    found = vsr.design(start, free, TipError(aim[None]), [[2.0]], constraints=[Inside(0.0005)], **settings)
+    routing = found.scene.actuators[0].routing
+    np.testing.assert_allclose([routing.y, routing.z], [0.003, 0.002], atol=5e-4)
+    assert np.all(np.isfinite(found.trace.objective))
+
+
 @pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "compliance")) for name in OBJECTIVES])
 def test_gradients_of_objectives_are_their_differences(scene, tips, name):
     """By radius, angle and all inputs, with constraints beside; differences of the objective alone."""

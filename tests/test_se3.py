@@ -108,3 +108,22 @@ def test_coadjoint_moves_by_coad_along_an_arm():
 def test_maps_of_a_batch_by_vmap():
     batch = jnp.stack([twist(i) for i in range(3)])
     np.testing.assert_allclose(jax.vmap(se3.exp)(batch)[1], se3.exp(batch[1]), atol=1e-15)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-3, 1.0, 2.0, 2.2, 3.0, 3.14159, np.pi])
+def test_rotation_vectors_are_those_of_the_exponential(angle):
+    """Half a turn included, where the skew part of the rotation is nothing: it was taken for no turn at all."""
+    for axis in np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, -1], [0.6, -0.8, 0], [0.48, 0.6, 0.64]]):
+        rotation = se3.exp(jnp.append(jnp.asarray(angle * axis), jnp.zeros(3)))[:3, :3]
+        found = np.asarray(se3.rotation_vector(rotation))
+        sign = np.sign(found @ axis) if angle == np.pi else 1.0
+        np.testing.assert_allclose(sign * found, angle * axis, atol=1e-12 * max(angle, 1e-3) + 1e-15)
+    exact = np.diag([1.0, -1.0, -1.0])
+    np.testing.assert_allclose(np.abs(se3.rotation_vector(jnp.asarray(exact))), [np.pi, 0, 0], atol=1e-15)
+
+
+def test_rotation_vectors_have_derivatives_up_to_half_a_turn():
+    for angle in (0.0, 0.5, 2.0, 2.2, 3.1, 3.14):
+        at = jnp.array([0.48, 0.6, 0.64]) * angle
+        slope = jax.jacfwd(lambda k: se3.rotation_vector(se3.exp(jnp.append(k, jnp.zeros(3)))[:3, :3]))(at)
+        np.testing.assert_allclose(slope, np.eye(3), atol=1e-10)

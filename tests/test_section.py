@@ -77,6 +77,26 @@ def test_clearance_is_the_distance_to_the_wall():
     assert vsr.Elliptic(0.02, 0.003).clearance(y, z, X, L) < 0
 
 
+SECTIONS = {
+    "circle": vsr.Circular(0.01),
+    "tube": vsr.Annular(0.01, 0.005),
+    "rectangle": vsr.Rectangular(0.02, 0.03),
+    "ellipse": vsr.Elliptic(0.02, 0.01),
+    "joined": vsr.Joined([0.4], [vsr.Circular(0.01), vsr.Elliptic(0.02, 0.01)]),
+}
+
+
+@pytest.mark.parametrize("name", SECTIONS)
+def test_clearance_on_the_axis_has_finite_derivatives(name):
+    section, guided = SECTIONS[name], vsr.Rod(L, SECTIONS[name], STEEL, guide_radius=0.05)
+    zero = jnp.zeros(())
+    for clearance, expected in ((lambda y, z: section.clearance(y, z, X, L), 0.01), (lambda y, z: guided.clearance(y, z, X), 0.05)):
+        value, slope = jax.value_and_grad(clearance, argnums=(0, 1))(zero, zero)
+        np.testing.assert_allclose(value, expected, rtol=1e-12)
+        assert np.all(np.abs(slope) <= (1.0 if name == "rectangle" else 0.0))  # of the kink the slope of one side
+        assert np.all(np.isfinite(jax.hessian(clearance, argnums=(0, 1))(zero, zero)))
+
+
 def test_profiles():
     knots, values = np.array([0.0, 0.2, 0.5, 0.75]), np.array([0.01, 0.012, 0.009, 0.008])
     cases = [

@@ -1,11 +1,13 @@
 """How a tip moves with numbers, inputs and wrenches: against differences of other solves, and beams that are known."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import vsr_jax as vsr
+from vsr_jax.model import SteppedModel
 from vsr_jax.parameters import replaced
 
 MODEL, FINER = vsr.StrainDependent(8), vsr.StrainDependent(12)
@@ -91,6 +93,42 @@ def test_compliance_is_what_a_small_wrench_does(eq):
         ahead, behind = (np.asarray(pushed(jnp.asarray(sign * step * np.eye(6)[i]))) for sign in (1, -1))
         np.testing.assert_allclose(C[:, i], np.concatenate(motion(ahead, behind, step)), atol=1e-4 * np.abs(C[:, i]).max())
     np.testing.assert_allclose(C, C.T, atol=1e-9 * np.abs(C).max())
+
+
+class Approximate(SteppedModel):
+    """A model of somebody else's, of which nothing is known but what models have to have: strains in one wave each."""
+
+    steps: int = eqx.field(static=True, default=8)
+    order: int = eqx.field(static=True, default=4)
+
+    @property
+    def inner(self):
+        return vsr.Prescribed(vsr.Basis.uniform(vsr.Legendre(0)), points=8, steps=self.steps, order=self.order)
+
+    def solve(self, scene, inputs):
+        return self.inner.solve(scene, inputs)
+
+    def strain(self, scene, forces, state, X):
+        return self.inner.strain(scene, forces, state, X)
+
+    def nodes(self, scene, forces, state):
+        return self.inner.nodes(scene, forces, state)
+
+    def node_strain(self, scene, state):
+        return self.inner.node_strain(scene, state)
+
+
+def test_compliance_of_a_model_that_says_nothing_is_the_derivative_of_its_solve(eq):
+    """The balance of its sections does not hold, so the integral of their compliances is another matrix."""
+    found = vsr.solve(eq.scene, eq.inputs, model=Approximate())
+    C, balanced = vsr.compliance(found), vsr.compliance(eq)
+    pushed = jax.jit(
+        lambda w: vsr.solve(vsr.Scene(eq.scene.rod, eq.scene.actuators, [vsr.TipWrench(w[3:], w[:3])]), eq.inputs, model=Approximate()).tip
+    )
+    step = 1e-4
+    ahead, behind = (np.asarray(pushed(jnp.asarray(sign * step * np.eye(6)[4]))) for sign in (1, -1))
+    np.testing.assert_allclose(C[:, 4], np.concatenate(motion(ahead, behind, step)), atol=1e-5 * np.abs(C[:, 4]).max())
+    assert np.abs(C - balanced)[:, 4].max() > 0.05 * np.abs(C[:, 4]).max()
 
 
 @pytest.mark.slow

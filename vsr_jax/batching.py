@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.custom_batching import custom_vmap
 
 _ALIASED = 64
@@ -46,4 +47,4 @@ def side_by_side(solve: Callable) -> Callable:
 
 def arms_in(tree: Any, axes: int) -> tuple[int, ...]:
     """Shape of the arms side by side: what the last `axes` axes of all arrays broadcast to."""
-    return jnp.broadcast_shapes(*(x.shape[x.ndim - axes :] for x in jax.tree.leaves(tree)))
+    return np.broadcast_shapes(*(x.shape[x.ndim - axes :] for x in jax.tree.leaves(tree)))

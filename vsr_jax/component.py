@@ -85,6 +85,13 @@ def dot(a: Vector, b: Vector) -> Array:
     return total
 
 
+def norm(a: Vector) -> Array:
+    """Length $|a|$, with the derivative 0 at zero, where it has none."""
+    square = dot(a, a)
+    zero = square == 0
+    return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, square)))
+
+
 def cross(a: Vector, b: Vector) -> Vector:
     """Vector product $a \\times b$ of two vectors of three components."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])

@@ -71,6 +71,7 @@ class Continuum(Model):
     max_steps: int = eqx.field(static=True)
     segments: int = eqx.field(static=True)
     derivative: StrainDependent
+    balanced_everywhere = True
 
     def __init__(
         self,

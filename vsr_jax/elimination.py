@@ -80,7 +80,7 @@ def eliminate(
     """
     if along is None or loads is None or min(free) > 2:
         x = c.cholesky_solve(c.cholesky(chosen_rows(lower, free)), chosen(right, free))
-        return spread(x, free), jnp.where(jnp.any(jnp.isnan(x[-1]), axis=(0, 1)), UNSTABLE_SECTION, 0)
+        return spread(x, free), jnp.where(jnp.any(jnp.isnan(x[-1]), axis=(0, 1)), UNSTABLE_SECTION, 0).astype(jnp.int32)
     flat = jax.tree.map(_flat, (lower, right, xi, along.wrench, along.rotation))
     lower, right, xi, wrench, rotation = c.keep(flat, flat[1][0])
     loads = loads._replace(follower_density=jax.tree.map(_flat, loads.follower_density))
@@ -102,7 +102,7 @@ def eliminate(
         force = c.add(force, c.add(c.matvec(push[0], c.add(theta, c.scale(cells.width, kappa))), push[1]))
     upsilon = c.subtract(c.matvec(linear.flexibility, force), c.matvec(linear.by_bend, kappa))
     strain = tuple(_unflat(x, grid) for x in (*kappa, *upsilon))
-    return strain, jnp.where(jnp.all(local, axis=0), jnp.sum(negative, axis=0), UNSTABLE_SECTION)
+    return strain, jnp.where(jnp.all(local, axis=0), jnp.sum(negative, axis=0, dtype=jnp.int32), UNSTABLE_SECTION)
 
 
 def _flat(x: Array) -> Array:

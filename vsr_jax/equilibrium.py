@@ -19,7 +19,7 @@ from .model import Model, Nodes, Outcome, Status
 from .quadrature import onto
 from .reaction import loading, react_at
 from .scene import Scene
-from .stability import extremes
+from .stability import extreme
 
 
 class Equilibrium(eqx.Module):
@@ -81,22 +81,23 @@ class Equilibrium(eqx.Module):
 
     @property
     def stability(self) -> Scalar:
-        r"""Margin of stability: the least eigenvalue of $\Sigma^{-1/2} (\Sigma - A) \Sigma^{-1/2}$ over the nodes; where loads or
-        given lengths tie the nodes to each other, of the whole tangent scaled the same way (its symmetric part).
+        r"""Stability margin: the least eigenvalue of $\Sigma^{-1/2} (\Sigma - A) \Sigma^{-1/2}$ over the nodes; where loads tie the nodes
+        to each other, of the whole tangent scaled the same way (its symmetric part) among the changes of strain that taut cables of
+        given length allow.
 
         1 for an arm without forces, at least 1 for tendons alone up to rounding, 0 where the equilibrium ceases to be stable.
         Loads that have no potential (dead moments in space, follower loads) leave a part that is not symmetric: with them a
-        margin below 0 does not prove instability.
+        margin below 0 does not prove instability. With loads it is found by Lanczos' method, and NaN in the rare case that its residual
+        stays above the root of the machine's epsilon. Where the least eigenvalue is multiple it has no derivative.
         """
         self._refuse_batch()
-        return self._mask(self._extremes()[0])
+        return self._extreme()
 
     @property
     def condition(self) -> Scalar:
         """Condition number of the scaled tangent stiffness of `stability`, greatest by least eigenvalue: it magnifies rounding."""
         self._refuse_batch()
-        least, greatest = self._extremes()
-        return self._mask(greatest / jnp.abs(least))
+        return self._extreme(greatest=True) / jnp.abs(self._extreme())
 
     @property
     def error(self) -> Error:
@@ -231,8 +232,8 @@ class Equilibrium(eqx.Module):
         return self._mask(slack)
 
     @eqx.filter_jit
-    def _extremes(self) -> tuple[Scalar, Scalar]:
-        return extremes(self.scene, self._sound_forces, self._nodes())
+    def _extreme(self, *, greatest: bool = False) -> Scalar:
+        return self._mask(extreme(self.scene, self._sound_forces, self._nodes(), greatest=greatest))
 
     @eqx.filter_jit
     def _reaction(self, X: Array) -> Array:

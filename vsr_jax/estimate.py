@@ -1,8 +1,8 @@
 r"""How far a solution is from the exact one: its tip and its strain against those of a coarser one, or of a finer one.
 
-- Without loads, on an arm that is one smooth piece, `StrainDependent` errs in its steps alone. Each two of them make one, with the
-  strain at its nodes by the polynomial through theirs: no balance is solved, and the tip moves by $2^p - 1$ times its error for
-  steps of order p. Four times as much is estimated, since few steps are not yet in that regime.
+- Without loads, on an arm that is one smooth piece, a model whose sections are balanced errs in its steps alone. Each two of them make
+  one, with the strain at its nodes by the polynomial through theirs: no balance is solved, and the tip moves by $2^p - 1$ times its
+  error for steps of order p. Four times as much is estimated, since few steps are not yet in that regime.
 - Otherwise a finer solution starts from the one at hand and is not solved anew. Without loads its cross-sections are balanced at
   twice as many steps of order 6. With loads, lengths or friction their strain follows from the solution's own reaction, and is then
   corrected by Newton steps of the whole arm with its approximate tangent, which leave a tenth of what was wrong or less.
@@ -49,7 +49,7 @@ def error_of(model: Model, scene: Scene, inputs: Array, forces: Vector, state: A
     """
     scene, inputs, forces, state = lax.stop_gradient((scene, inputs, forces, state))
     share = 1.0
-    if isinstance(model, StrainDependent) and _by_pairs(model, scene):
+    if isinstance(model, SteppedModel) and model.balanced_everywhere and _by_pairs(model, scene):
         grid, xi = model.grid(scene), model.node_strain(scene, state)
         tip, fine = _paired_tip(xi, grid, scene), xi
         share = _UNSETTLED * model.steps / (model.steps // 2 * 2) / (2**model.order - 1)
@@ -61,7 +61,7 @@ def error_of(model: Model, scene: Scene, inputs: Array, forces: Vector, state: A
         found, X = finer.solve(scene, inputs), grid.X.reshape(-1)
         tip = finer.tip(scene, found.forces, found.state)
         xi, fine = (m.strain(scene, f, s, X) for m, f, s in ((model, forces, state), (finer, found.forces, found.state)))
-    moved = share * jnp.linalg.norm((tip - model.tip(scene, forces, state))[:3, 3])
+    moved = share * c.norm(c.split((tip - model.tip(scene, forces, state))[:3, 3]))
     change = jnp.stack([jnp.max(jnp.abs(a - b)) for a, b in zip(xi, fine, strict=True)])
     size = jnp.stack([jnp.max(jnp.abs(x)) for x in fine])
     least = _ROUNDED * jnp.finfo(moved.dtype).eps
@@ -74,7 +74,7 @@ def error_of(model: Model, scene: Scene, inputs: Array, forces: Vector, state: A
     )
 
 
-def _by_pairs(model: StrainDependent, scene: Scene) -> bool:
+def _by_pairs(model: SteppedModel, scene: Scene) -> bool:
     """Whether steps can be taken in twos."""
     return not scene.coupled and scene.edges().size == 2 and model.steps > 1
 
@@ -94,7 +94,7 @@ def _corrected(model: SteppedModel, scene: Scene, inputs: Array, forces: Vector,
     xi = tuple(x.reshape(grid.X.shape) for x in xi)
     if scene.coupled:
         return xi, _together(model, scene, inputs, forces, state, xi, grid), grid
-    if isinstance(model, StrainDependent):
+    if model.balanced_everywhere:
         return xi, xi, grid
     sections = scene.sections(grid.X)
     return xi, solve_balance(sections, sections.carry(forces), None, scene.free, xi).xi, grid

@@ -16,7 +16,7 @@ from jaxtyping import Array
 
 from ._types import Scalar
 from .balance import chosen, thread_direction, thread_wrench
-from .component import Vector, scale
+from .component import Vector, norm, scale, split
 from .equilibrium import Equilibrium
 from .load import Frame, Load
 from .model import Model, Status
@@ -116,7 +116,7 @@ def _check(eq: Equilibrium) -> Health:
         _independence(scene) if len(scene.actuators) > 1 else None,
         first if scene.actuators else None,
         last if scene.loads else None,
-        jnp.linalg.norm(finer.tip[:3, 3] - eq.tip[:3, 3]),
+        norm(split(finer.tip[:3, 3] - eq.tip[:3, 3])),
     )
 
 

@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float
 from . import box
 from ._check import instance, interval, numbers, on_arm, positive, rigid
 from ._types import Scalar, cast
+from .component import norm, split
 from .equilibrium import Equilibrium
 from .model import Model
 from .scene import Scene
@@ -153,7 +154,7 @@ def _reach(task: _Task, allowed: Scalar) -> Reach:
     found = box.nearest(still.missed, lax.stop_gradient(_starts(tried, distance)), still.idle, enough)
     share = _moving(task, found)
     there = task.at(share)
-    miss = jnp.linalg.norm(task.misses(task.places(there)))
+    miss = norm(split(task.misses(task.places(there))))
     miss = jnp.where(jnp.isfinite(miss), miss, jnp.inf)
     return Reach(task.inputs(share), there, miss, miss <= allowed, allowed)
 

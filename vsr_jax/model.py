@@ -3,7 +3,7 @@
 from abc import abstractmethod
 from dataclasses import replace
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -77,7 +77,13 @@ class Outcome(NamedTuple):
 
 
 class Model(eqx.Module):
-    """A way to find and to describe the equilibrium of a scene."""
+    """A way to find and to describe the equilibrium of a scene.
+
+    `balanced_everywhere` says whether the balance of the cross-section (eq. 21) holds wherever `strain` is asked for, to rounding or
+    the model's tolerances. Then derivatives and errors may be taken from the balance instead of from `solve`.
+    """
+
+    balanced_everywhere: ClassVar[bool] = False
 
     @abstractmethod
     def solve(self, scene: Scene, inputs: Float[Array, " inputs"]) -> Outcome:
@@ -134,7 +140,8 @@ class SteppedModel(Model):
 
     def step_error(self, scene: Scene, forces: Vector, state: Any) -> Scalar:
         nodes = self.nodes(scene, forces, state)
-        return step_error(nodes.xi, nodes.sections, forces, nodes.grid, loaded=bool(scene.loads))
+        sections = nodes.sections._replace(reach=nodes.shares)  # friction takes of a thread's force, no load does
+        return step_error(nodes.xi, sections, forces, nodes.grid, loaded=bool(scene.loads))
 
     @abstractmethod
     def node_strain(self, scene: Scene, state: Any) -> Vector:

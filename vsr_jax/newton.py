@@ -22,6 +22,7 @@ _LEAST_DAMPING, _MOST_DAMPING = 0.1, 1e8
 _RAISE, _LOWER = 10.0, 30.0
 _LEAST_LEFT, _MOST_LEFT = 0.25, 0.99
 _ACCEPTED = 64
+_MOST_RISES = 3
 
 
 class Evaluation(NamedTuple):
@@ -114,10 +115,10 @@ def damped_newton(
     step with it, the rest of the geometric series.
 
     The end is reached where the residual is one that is accepted, the step is undamped, and either the step is negligible or
-    the residual no longer falls by half: rounding. Nothing that would be refused ends the loop before its bounds do. A problem
+    the residual has risen three times: rounding. Nothing that would be refused ends the loop before its bounds do. A problem
     that meets the bound on its evaluations or on $\mu$ gets some plain Newton steps from where it is: these end in an
     equilibrium that is not stable where there is one nearby. The last step is never taken, so that the residual returned is that
-    of the point returned. Problems may stand side by side, in the last axes of all arrays: each goes its own way and stands
+    of the point returned. Problems may be solved together, in the last axes of all arrays: each takes its own steps and stands
     still when it is done.
 
     **Arguments:**
@@ -131,7 +132,7 @@ def damped_newton(
     accepted = jnp.maximum(_ACCEPTED * floor, small)
 
     def pending(guard: _Guard) -> Array:
-        negligible = (guard.size < small) | guard.stalled
+        negligible = (guard.size < small) | (guard.rises >= _MOST_RISES)
         done = guard.fresh & (guard.damping == 0) & (guard.merit <= accepted) & negligible
         stuck = ~guard.definite & (guard.merit < floor)
         return ~((done | stuck) & (guard.given == shares)) & (guard.plain < MAX_PLAIN_STEPS)
@@ -148,10 +149,9 @@ def damped_newton(
         taken = ~old.fresh | (jnp.isfinite(new.merit) & better)
         damping = jnp.where(taken & (new.definite | plain), damping, _raised(jnp.where(taken, damping, old.damping)))
         whole = (old.damping == 0) & (damping == 0) & old.fresh & (old.given == shares)
-        more = _extrapolated(jnp.minimum(left / old.pull, new.size / old.size))
-        more = jnp.where(whole & (new.merit > 4 * floor), more, 0.0)
+        more = _extrapolated(whole & (new.merit > 4 * floor), jnp.minimum(left / old.pull, new.size / old.size))
         new = new._replace(step=jax.tree.map(lambda s, last: s + more.astype(s.dtype) * last, new.step, step))
-        stalled = whole & (new.merit > 0.5 * old.merit)
+        rises = old.rises + (whole & (old.merit <= accepted) & (new.merit >= old.merit)).astype(jnp.int32)
         there = _Guard(
             new.size,
             new.merit,
@@ -160,7 +160,7 @@ def damped_newton(
             damping,
             given,
             new.definite | plain,
-            stalled,
+            rises,
             old.spent,
             old.plain,
         )
@@ -170,10 +170,9 @@ def damped_newton(
         go = pending(old)
         return _where(go & taken, trial, x), new.step, _where(go, guard, old)
 
-    zero, no = jnp.zeros_like(floor), jnp.zeros(floor.shape, bool)
+    zero, no, none = jnp.zeros_like(floor), jnp.zeros(floor.shape, bool), jnp.zeros(floor.shape, jnp.int32)
     damping = jnp.full_like(floor, _LEAST_DAMPING if shares == 1 else 0.0)
-    count = jnp.zeros(floor.shape, jnp.int32)
-    guard = _Guard(zero, zero + jnp.inf, ~no, zero, damping, zero + 1, no, no, count, count)
+    guard = _Guard(zero, zero + jnp.inf, ~no, zero, damping, zero + 1, no, none, none, none)
     step = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(evaluate, start, floor, floor).step)
     x, _, guard = lax.while_loop(lambda state: jnp.any(pending(state[2])), advance, (start, step, guard))
     return Solution(x, guard.merit <= accepted, guard.definite, guard.spent)
@@ -182,7 +181,7 @@ def damped_newton(
 class _Guard(NamedTuple):
     """What `damped_newton` keeps of each problem besides the point and the step: size of the step, of the residual, whether
     the tangent is definite, the work of the residual over the step; damping, shares of the loads so far, whether the step may
-    be tried, whether the last undamped step left more than half of the residual, evaluations so far, and the plain ones of them."""
+    be tried, how often an undamped step raised a residual that is accepted, evaluations so far, and the plain ones of them."""
 
     size: Array
     merit: Array
@@ -191,15 +190,15 @@ class _Guard(NamedTuple):
     damping: Array
     given: Array
     fresh: Array
-    stalled: Array
+    rises: Array
     spent: Array
     plain: Array
 
 
-def _extrapolated(left: Array) -> Array:
-    """How much of the last step to take again, from the share of the residual that it left along itself."""
+def _extrapolated(wanted: Array, left: Array) -> Array:
+    """How much of the last step to take again where wanted, from the share of the residual that it left along itself."""
     share = jnp.clip(left, 0.0, _MOST_LEFT)
-    return jnp.where(share > _LEAST_LEFT, share**2 / (1 - share), 0.0)
+    return jnp.where(wanted & (share > _LEAST_LEFT), share**2 / (1 - share), 0.0)
 
 
 def _raised(damping: Array) -> Array:

@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from ._check import instance, numbers, rigid
 from ._types import Pose, Scalar
-from .component import Vector
+from .component import Vector, norm
 from .material import Material
 from .profile import FunctionOfX, Limits, Profile, as_profile
 from .section import Section
@@ -78,7 +78,7 @@ class Rod(eqx.Module):
     def clearance(self, y: Scalar, z: Scalar, X: Scalar) -> Array:
         """How far (y, z) lies inside what guides threads at X: positive inside [m]."""
         inside = self.section.clearance(y, z, X, self.length)
-        return inside if self.guide_radius is None else jnp.maximum(inside, self.guide_radius - jnp.sqrt(y**2 + z**2))
+        return inside if self.guide_radius is None else jnp.maximum(inside, self.guide_radius - norm((y, z)))
 
     @property
     def breakpoints(self) -> tuple[Scalar, ...]:

@@ -142,15 +142,21 @@ def inverse(g: Pose) -> Pose:
 def rotation_vector(rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
     r"""Axis times angle [rad] of a rotation, $\theta$ with $R = \exp \tilde\theta$, $|\theta| \le \pi$.
 
-    Smooth at the identity; at half a turn its length is right and its sign is not sure.
+    Smooth but at half a turn, where both signs are right. The axis is that of the skew part, $\sin\theta\, n$; for large angles that
+    of the symmetric part, $(1 - \cos\theta)\, n n^T$.
     """
     axis = 0.5 * jnp.stack([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
+    cosine = 0.5 * (jnp.trace(rotation) - 1)
     square = jnp.dot(axis, axis)
-    small = square < 1e-8
-    sine = jnp.sqrt(jnp.where(small, 1.0, square))
-    angle = jnp.arctan2(sine, (jnp.trace(rotation) - 1) / 2)
-    near = jnp.trace(rotation) > 1
-    return jnp.where(small & near, 1 + square / 6, angle / sine) * axis
+    near, large = (square < 1e-8) & (cosine > 0), cosine < -0.5
+    sine = jnp.sqrt(jnp.where(near | large, 1.0, square))
+    factor = jnp.where(near, 1 + square / 6, jnp.arctan2(sine, jnp.where(near | large, 1.0, cosine)) / sine)
+    outer = 0.5 * (rotation + rotation.T) - cosine * jnp.eye(3, dtype=rotation.dtype)
+    outer = jnp.where(large, outer, jnp.eye(3, dtype=rotation.dtype))
+    column = outer[:, jnp.argmax(jnp.diagonal(outer))]
+    n = column / jnp.sqrt(jnp.dot(column, column))
+    turned = jnp.arctan2(jnp.dot(n, axis), jnp.where(large, cosine, -1.0)) * n
+    return jnp.where(large, turned, factor * axis)
 
 
 def _blocks(a: Array, b: Array, c_: Array, d: Array) -> Float[Array, "6 6"]:

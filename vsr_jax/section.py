@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 
 from ._check import choice, concrete, instance, numbers
 from ._types import Scalar
+from .component import norm
 from .profile import Constant, Limits, Profile, as_profile, pick, rising_ends, scaled
 
 Torsion = Literal["saint_venant", "polar"]
@@ -99,7 +100,7 @@ class Circular(Section):
         return Geometry(math.pi * r**2, moment, moment, 2 * moment, self.shear_correction)
 
     def clearance(self, y: Scalar, z: Scalar, X: Scalar, length: Scalar) -> Scalar:
-        return self.radius(X, length) - jnp.sqrt(y**2 + z**2)
+        return self.radius(X, length) - norm((y, z))
 
     def outline(self, angle: Array, X: Scalar, length: Scalar) -> tuple[Array, Array]:
         r = self.radius(X, length)
@@ -133,7 +134,7 @@ class Annular(Section):
         return Geometry(math.pi * (outer**2 - inner**2), moment, moment, 2 * moment, self.shear_correction)
 
     def clearance(self, y: Scalar, z: Scalar, X: Scalar, length: Scalar) -> Scalar:
-        return self.outer(X, length) - jnp.sqrt(y**2 + z**2)
+        return self.outer(X, length) - norm((y, z))
 
     def outline(self, angle: Array, X: Scalar, length: Scalar) -> tuple[Array, Array]:
         r = self.outer(X, length)
@@ -218,7 +219,7 @@ class Elliptic(Section):
 
     def clearance(self, y: Scalar, z: Scalar, X: Scalar, length: Scalar) -> Scalar:
         a, b = self.half_y(X, length), self.half_z(X, length)
-        return (1 - jnp.sqrt((y / a) ** 2 + (z / b) ** 2)) * jnp.minimum(a, b)
+        return (1 - norm((y / a, z / b))) * jnp.minimum(a, b)
 
     def outline(self, angle: Array, X: Scalar, length: Scalar) -> tuple[Array, Array]:
         return self.half_y(X, length) * jnp.cos(angle), self.half_z(X, length) * jnp.sin(angle)

@@ -14,7 +14,6 @@ from jaxtyping import Array, Float
 from . import component as c
 from ._types import Pose
 from .balance import chosen_rows, tangent
-from .discrete import Prescribed
 from .equilibrium import Equilibrium
 from .load import TipWrench
 from .parameters import parameters, replaced
@@ -111,8 +110,9 @@ def _by_inputs(eq: Equilibrium) -> Array:
 def compliance(eq: Equilibrium) -> Float[Array, "6 6"]:
     r"""What a small dead wrench on the tip moves it by: $(\delta\theta, \delta r) = C (\delta M, \delta F)$, in the world's axes.
 
-    Without loads $C = \int G^T (\Sigma - A)^{-1} G \, dX$, where G carries the wrench to the sections. With loads, given lengths or
-    friction, and for `Prescribed`, the implicit derivative of the solve with a `TipWrench`.
+    Without loads $C = \int G^T (\Sigma - A)^{-1} G \, dX$, where G carries the wrench to the sections, for models that are
+    `balanced_everywhere`. With loads, given lengths or friction, and for all other models, the derivative of the solve with one more
+    `TipWrench`.
 
     **Arguments:** `eq`: a solved scene, one at a time; NaN where it failed.
 
@@ -123,7 +123,7 @@ def compliance(eq: Equilibrium) -> Float[Array, "6 6"]:
 
 @eqx.filter_jit
 def _compliance(eq: Equilibrium) -> Array:
-    if eq.scene.coupled or isinstance(eq.model, Prescribed):
+    if eq.scene.coupled or not eq.model.balanced_everywhere:
         return eq._mask(jax.jacfwd(lambda wrench: _motion(_pushed(eq, wrench).tip, eq.tip))(jnp.zeros(6, eq.inputs.dtype)))
     nodes, free = eq._nodes(), jnp.array(eq.scene.free)
     rows = tangent(nodes.xi, nodes.sections, nodes.tau(eq._sound_forces))
@@ -158,7 +158,7 @@ class Ellipsoid(NamedTuple):
     @property
     def measure(self) -> Array:
         """Product of the half axes; 0 where it is flat."""
-        return jnp.prod(jnp.linalg.norm(self.axes, axis=0))
+        return jnp.prod(c.norm(c.split(self.axes.T)))
 
 
 def ellipsoid(matrix: Float[Array, "3 columns"], centre: Float[Array, "3"]) -> Ellipsoid:

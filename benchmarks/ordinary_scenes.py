@@ -1,0 +1,213 @@
+"""Scenes of an ordinary size, drawn at random: what a solver should never refuse while they have a stable equilibrium.
+
+A `Structure` says what a scene has: tendons (by tension or length, elastic or not, with friction, ending on the way) and loads. It
+is static: all draws of a structure are solved by one compiled program. A draw is a dictionary of numbers in SI units, each a float or
+a list, that `built` turns into a scene and its inputs; a copy of the dictionary is all that a test needs.
+
+Sizes: $L / r$ from 10 to 3000; taper to half the radius; curved at rest in half of the draws; weight $\\rho g A L^3 / EI$ up to 30 in
+any direction; forces up to $10\\,EI / L^2$, moments up to $5\\,EI / L$; tendons at 0.2 to 0.9 of the guide radius that together bend
+the arm by about half a turn.
+"""
+
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+import vsr_jax as vsr
+
+Numbers = dict[str, Any]
+DENSITY = 1000.0
+PARALLEL = 1e-9
+"""Turns of a helix that is a parallel."""
+MOST_WEIGHT, MOST_FORCE, MOST_MOMENT = 30.0, 10.0, 5.0
+MOST_BEND = np.pi
+COLLAPSE_SHARE = 0.2
+"""Largest share that the tensions have of those at which the tip's section collapses."""
+
+
+class Laid(NamedTuple):
+    """A tendon of a structure, or a chamber: how it is driven, whether it is elastic, rubs, winds or ends before the tip."""
+
+    control: Literal["tension", "length", "pressure"] = "tension"
+    elastic: bool = False
+    motion: Literal["pull", "release"] | None = None
+    winds: bool = False
+    ends: bool = False
+
+
+class Structure(NamedTuple):
+    """What a scene has: tendons; gravity; wrenches by name, see `_loads`; and how its numbers are drawn."""
+
+    tendons: tuple[Laid, ...] = ()
+    gravity: bool = False
+    wrenches: tuple[str, ...] = ()
+    draw: Callable[["Structure", np.random.Generator], Numbers] | None = None
+
+    def numbers(self, random: np.random.Generator) -> Numbers:
+        """One draw."""
+        return (self.draw or ordinary)(self, random)
+
+
+def built(structure: Structure, numbers: Numbers, share: Any = 1.0) -> tuple[vsr.Scene, Any]:
+    """Scene and inputs of a draw, loads and inputs times `share`."""
+    n = {name: jnp.asarray(value) for name, value in numbers.items()}
+    section = vsr.Circular(vsr.Taper(n["radius"], n["tip_radius"]))
+    material = vsr.Material(n["young"], poisson=n["poisson"], density=DENSITY)
+    rest = (0.0, n["curvature"][0], n["curvature"][1], 1.0, 0.0, 0.0)
+    rod = vsr.Rod(n["length"], section, material, rest_strain=rest, guide_radius=n["guide_radius"])
+    tendons = []
+    for i, laid in enumerate(structure.tendons):
+        path = vsr.Helix(n["place"][i], pitch=n["length"] / n["turns"][i], phase=n["phase"][i])
+        if laid.control == "pressure":
+            tendons.append(vsr.Chamber(path, area=n["area"]))
+            continue
+        tendons.append(
+            vsr.Tendon(
+                path,
+                end=n["end"][i] if laid.ends else None,
+                control=laid.control,
+                stiffness=n["stiffness"][i] if laid.elastic else None,
+                friction=n["friction"][i] if laid.motion else None,
+                motion=laid.motion or "pull",
+            )
+        )
+    return vsr.Scene(rod, tendons, _loads(structure, n, share)), share * n["inputs"] if tendons else jnp.zeros(0)
+
+
+def _loads(structure: Structure, n: Numbers, share: Any) -> list[Any]:
+    loads: list[Any] = [vsr.Gravity(share * n["gravity"])] if structure.gravity else []
+    for name in structure.wrenches:
+        kind, frame = name.split()[0], "body" if name.endswith("body") else "world"
+        force, moment = share * n[f"{name} force"], share * n[f"{name} moment"]
+        if kind == "tip":
+            loads.append(vsr.TipWrench(force, moment, frame))
+        elif kind == "point":
+            loads.append(vsr.PointWrench(n["point"], force, moment, frame))
+        else:
+            loads.append(vsr.DistributedWrench(tuple(force), tuple(moment), frame))
+    return loads
+
+
+def ordinary(structure: Structure, random: np.random.Generator) -> Numbers:
+    """Numbers of an ordinary scene."""
+    length, slender = 10 ** random.uniform(-1.3, 0.0), 10 ** random.uniform(1, np.log10(3000))
+    radius, young, taper = length / slender, 10 ** random.uniform(5, 11.3), random.uniform(0.5, 1.0)
+    bending = young * np.pi * radius**4 / 4
+    numbers = {
+        "length": length,
+        "radius": radius,
+        "tip_radius": taper * radius,
+        "young": young,
+        "poisson": random.uniform(0.2, 0.49),
+        "guide_radius": radius * random.uniform(1.0, 2.0),
+        "curvature": random.uniform(-2, 2, 2) / length * (random.random() < 0.5),
+        "gravity": _direction(random) * MOST_WEIGHT * random.random() ** 2 * bending / length**3 / (DENSITY * np.pi * radius**2),
+        "point": length * random.uniform(0.3, 0.9),
+    }
+    for name in structure.wrenches:
+        unit = bending / length if name.startswith("spread") else bending
+        numbers[f"{name} force"] = _direction(random) * MOST_FORCE * random.random() ** 2 * unit / length**2
+        numbers[f"{name} moment"] = _direction(random) * MOST_MOMENT * random.random() ** 2 * unit / length
+    return plain(numbers | _tendons(structure, random, numbers))
+
+
+def _tendons(structure: Structure, random: np.random.Generator, numbers: Numbers) -> Numbers:
+    """Where the tendons lie and how they are driven."""
+    count, length, taper = len(structure.tendons), numbers["length"], numbers["tip_radius"] / numbers["radius"]
+    if not count:
+        return {}
+    place = numbers["guide_radius"] * random.uniform(0.2, 0.9, count)
+    phase = random.uniform(0, 2 * np.pi) + 2 * np.pi * np.arange(count) / count + random.uniform(-0.3, 0.3, count)
+    winds = np.array([laid.winds for laid in structure.tendons])
+    axial = numbers["young"] * np.pi * numbers["tip_radius"] ** 2
+    compliance = (taper**-3 - 1) / (3 * (1 - taper)) if taper < 0.999 else 1.0
+    bend = numbers["young"] * np.pi * numbers["radius"] ** 4 / 4 / (place * length * compliance)
+    collapse = 1 / (1 / axial + place**2 / (axial * numbers["tip_radius"] ** 2 / 4))
+    share = np.minimum(1.0, 2.0 / count)
+    tension = random.random(count) * share * np.minimum(MOST_BEND * bend, COLLAPSE_SHARE * collapse)
+    driven = np.array([laid.control == "length" for laid in structure.tendons])
+    # lengths of an arm bent in one plane, each drawn in or let out a little besides, by no more than the tension above stretches it
+    angle, plane = MOST_BEND * random.random(), random.uniform(0, 2 * np.pi)
+    wound = np.where(winds, 0.3, 1.0)
+    more = np.minimum(0.1 * place * random.uniform(-1, 1, count), share * COLLAPSE_SHARE * collapse * length / axial)
+    change = np.maximum(-place * angle * np.cos(phase - plane) * wound + more, -COLLAPSE_SHARE * length)
+    return {
+        "place": place,
+        "phase": phase,
+        "turns": np.where(winds, random.uniform(0.2, 2.0, count), PARALLEL),
+        "end": length * random.uniform(0.4, 1.0, count),
+        "stiffness": axial * 10 ** random.uniform(-2, 1, count),
+        "friction": random.uniform(0, 0.3, count),
+        "inputs": np.where(driven, change, tension),
+    }
+
+
+def catheter(structure: Structure, random: np.random.Generator) -> Numbers:
+    """A stiff slender catheter with four tendons near its wall, 0 to 3 N each, and 0.5 N at the tip in any direction."""
+    return plain(
+        {
+            "length": 0.2,
+            "radius": 5e-4,
+            "tip_radius": 5e-4,
+            "young": 60e9,
+            "poisson": 0.3,
+            "guide_radius": 5e-4,
+            "curvature": np.zeros(2),
+            "place": np.full(4, 4.5e-4),
+            "phase": np.arange(4) * np.pi / 2,
+            "turns": np.full(4, PARALLEL),
+            "tip world force": 0.5 * _direction(random),
+            "tip world moment": np.zeros(3),
+            "inputs": random.uniform(0, 3, 4),
+        }
+    )
+
+
+def upright(structure: Structure, random: np.random.Generator) -> Numbers:
+    """A silicone arm upright under its weight, from half to some times what its modulus can bear, its chamber at no pressure."""
+    gravity = np.array([-9.81, 0.0, 0.0])
+    return plain(
+        {
+            "length": 0.3,
+            "radius": 0.010,
+            "tip_radius": 0.004,
+            "young": 10 ** random.uniform(5.5, 6.2),
+            "poisson": 0.45,
+            "guide_radius": 0.010,
+            "curvature": np.zeros(2),
+            "gravity": gravity,
+            "place": np.full(1, 0.003),
+            "phase": np.full(1, random.uniform(0, 2 * np.pi)),
+            "turns": np.full(1, PARALLEL),
+            "area": 1e-5,
+            "inputs": np.zeros(1),
+        }
+    )
+
+
+def _direction(random: np.random.Generator) -> np.ndarray:
+    vector = random.normal(size=3)
+    return vector / np.linalg.norm(vector)
+
+
+def plain(numbers: Numbers) -> Numbers:
+    """The numbers as floats and lists, as JSON keeps them."""
+    return {name: np.asarray(value, float).tolist() for name, value in numbers.items()}
+
+
+TENSION, WOUND, LENGTH = Laid(), Laid(winds=True), Laid("length")
+
+STRUCTURES = {
+    "tip wrench and gravity": Structure((), True, ("tip world",)),
+    "catheter": Structure((TENSION,) * 4, False, ("tip world",), catheter),
+    "upright, chamber at rest": Structure((Laid("pressure"),), True, (), upright),
+    "follower wrenches": Structure((), True, ("tip body", "spread body")),
+    "dead wrenches, three tendons": Structure((TENSION, WOUND, Laid(ends=True)), True, ("point world", "spread world")),
+    "nine tendons": Structure((TENSION, WOUND, Laid(ends=True)) * 3, True, ("tip body",)),
+    "three lengths": Structure((LENGTH,) * 3, True, ("tip world",)),
+    "lengths and tensions": Structure((LENGTH, Laid("length", elastic=True, winds=True), TENSION, Laid(ends=True)), False, ("tip world",)),
+    "friction": Structure((Laid(motion="pull"), Laid(motion="pull", winds=True), Laid(motion="release")), True, ("tip world",)),
+    "friction, lengths": Structure((Laid("length", motion="pull"), Laid("length", motion="pull", winds=True), TENSION), True),
+}

@@ -1,0 +1,72 @@
+"""Ordinary scenes are not refused: small versions of the search for false failures, and the program by which it judges."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vsr_jax as vsr
+from benchmarks.false_failures import search
+from benchmarks.load_steps import Arm
+from benchmarks.ordinary_scenes import STRUCTURES, built
+
+GREENHILL = 7.8373
+
+
+def stack(draws):
+    return {name: jnp.asarray(np.array([draw[name] for draw in draws])) for name in draws[0]}
+
+
+def draws(name, count, seed=1):
+    return [STRUCTURES[name].numbers(np.random.default_rng((seed, i))) for i in range(count)]
+
+
+def straight_column(weight):
+    """An upright rod of a given weight by $EI / L^3$, without a load at its tip."""
+    numbers = draws("tip wrench and gravity", 1)[0]
+    bending, area = numbers["young"] * np.pi * numbers["radius"] ** 4 / 4, np.pi * numbers["radius"] ** 2
+    gravity = weight * bending / numbers["length"] ** 3 / (1000.0 * area)
+    loads = {"gravity": [-gravity, 0.0, 0.0], "tip world force": [0.0] * 3, "tip world moment": [0.0] * 3}
+    return numbers | loads | {"tip_radius": numbers["radius"], "curvature": [0.0, 0.0]}
+
+
+@pytest.mark.parametrize("weight", [5.0, 30.0])
+def test_the_independent_path_ends_where_a_column_buckles(weight):
+    path = Arm(STRUCTURES["tip wrench and gravity"], straight_column(weight)).follow()
+    assert path.arrived == (weight < GREENHILL)
+    if not path.arrived:
+        np.testing.assert_allclose(path.share * weight, GREENHILL, rtol=3e-3)
+
+
+@pytest.mark.parametrize("name", STRUCTURES)
+def test_the_independent_tangent_is_that_of_differences(name):
+    arm = Arm(STRUCTURES[name], draws(name, 1)[0], 24)
+    arm.friction = [0.0] * len(arm.friction)  # whose shares are those of the last iterate
+    random = np.random.default_rng(0)
+    scale = np.array([1, 1, 1, 0.01, 0.01, 0.01])
+    xi = arm.rest + scale * (0.3 * random.normal(size=6) + 0.1 * np.sin(3 * arm.middle)[:, None])
+    tension, change, pull = np.ones(len(arm.driven)), scale * np.sin(2 * arm.middle + 0.3)[:, None], random.normal(size=len(arm.driven))
+    ahead, behind = (arm.system(xi + e * change, tension + e * pull, 0.7)[0] for e in (1e-6, -1e-6))
+    found = arm.system(xi, tension, 0.7)[1] @ np.concatenate([change.reshape(-1), pull])
+    expected = (ahead - behind) / 2e-6
+    np.testing.assert_allclose(found, expected, atol=1e-3 * np.max(np.abs(expected)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["catheter", "tip wrench and gravity"])
+def test_ordinary_scenes_are_not_refused(name):
+    record = search(name, 40, seed=2)
+    assert not record["cases"], json.dumps(record["cases"])
+    assert record["have a stable equilibrium"] > 30
+
+
+@pytest.mark.slow
+def test_an_upright_arm_with_a_chamber_at_rest_stands_or_is_unstable():
+    name = "upright, chamber at rest"
+    structure, drawn = STRUCTURES[name], draws(name, 24)
+    solved = jax.jit(jax.vmap(lambda numbers: vsr.solve(*built(structure, numbers), model=vsr.StrainDependent(16)).status))
+    stands = np.array([Arm(structure, numbers).follow().arrived for numbers in drawn])
+    assert 4 < np.sum(stands) < 20
+    np.testing.assert_array_equal(solved(stack(drawn)), np.where(stands, vsr.Status.CONVERGED, vsr.Status.UNSTABLE))
