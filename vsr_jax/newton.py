@@ -114,12 +114,12 @@ def damped_newton(
     a full step is a share $\rho$ near 1, and the steps shrink by it alone: so the next takes $\rho^2 / (1 - \rho)$ of the last
     step with it, the rest of the geometric series.
 
-    The end is reached where the residual is one that is accepted, the step is undamped, and either the step is negligible or
-    the residual has risen three times: rounding. Nothing that would be refused ends the loop before its bounds do. A problem
-    that meets the bound on its evaluations or on $\mu$ gets some plain Newton steps from where it is: these end in an
-    equilibrium that is not stable where there is one nearby. The last step is never taken, so that the residual returned is that
-    of the point returned. Problems may be solved together, in the last axes of all arrays: each takes its own steps and stands
-    still when it is done.
+    The end is reached where the residual is one that is accepted, the step is undamped, and either the step is negligible
+    together with those that would follow it, $1 / (1 - \rho)$ of it, or the residual has risen three times: rounding. Nothing
+    that would be refused ends the loop before its bounds do. A problem that meets the bound on its evaluations or on $\mu$ gets
+    some plain Newton steps from where it is: these end in an equilibrium that is not stable where there is one nearby. The last
+    step is never taken, so that the residual returned is that of the point returned. Problems may be solved together, in the last
+    axes of all arrays: each takes its own steps and stands still when it is done.
 
     **Arguments:**
     - `evaluate`: maps a point, a damping $\mu$ and the share of the loads to `Damped`.
@@ -132,7 +132,7 @@ def damped_newton(
     accepted = jnp.maximum(_ACCEPTED * floor, small)
 
     def pending(guard: _Guard) -> Array:
-        negligible = (guard.size < small) | (guard.rises >= _MOST_RISES)
+        negligible = (guard.miss < small) | (guard.rises >= _MOST_RISES)
         done = guard.fresh & (guard.damping == 0) & (guard.merit <= accepted) & negligible
         stuck = ~guard.definite & (guard.merit < floor)
         return ~((done | stuck) & (guard.given == shares)) & (guard.plain < MAX_PLAIN_STEPS)
@@ -151,9 +151,11 @@ def damped_newton(
         whole = (old.damping == 0) & (damping == 0) & old.fresh & (old.given == shares)
         more = _extrapolated(whole & (new.merit > 4 * floor), jnp.minimum(left / old.pull, new.size / old.size))
         new = new._replace(step=jax.tree.map(lambda s, last: s + more.astype(s.dtype) * last, new.step, step))
+        share = jnp.where(whole, jnp.clip(new.size / old.size, 0.0, _MOST_LEFT), 0.0)
         rises = old.rises + (whole & (old.merit <= accepted) & (new.merit >= old.merit)).astype(jnp.int32)
         there = _Guard(
             new.size,
+            new.size / (1 - share),
             new.merit,
             new.definite,
             work(new.residual, new.step),
@@ -172,18 +174,20 @@ def damped_newton(
 
     zero, no, none = jnp.zeros_like(floor), jnp.zeros(floor.shape, bool), jnp.zeros(floor.shape, jnp.int32)
     damping = jnp.full_like(floor, _LEAST_DAMPING if shares == 1 else 0.0)
-    guard = _Guard(zero, zero + jnp.inf, ~no, zero, damping, zero + 1, no, none, none, none)
+    guard = _Guard(zero, zero, zero + jnp.inf, ~no, zero, damping, zero + 1, no, none, none, none)
     step = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(evaluate, start, floor, floor).step)
     x, _, guard = lax.while_loop(lambda state: jnp.any(pending(state[2])), advance, (start, step, guard))
     return Solution(x, guard.merit <= accepted, guard.definite, guard.spent)
 
 
 class _Guard(NamedTuple):
-    """What `damped_newton` keeps of each problem besides the point and the step: size of the step, of the residual, whether
-    the tangent is definite, the work of the residual over the step; damping, shares of the loads so far, whether the step may
-    be tried, how often an undamped step raised a residual that is accepted, evaluations so far, and the plain ones of them."""
+    """What `damped_newton` keeps of each problem besides the point and the step: size of the step, what is missed without it
+    and those that would follow, size of the residual, whether the tangent is definite, the work of the residual over the step;
+    damping, shares of the loads so far, whether the step may be tried, how often an undamped step raised a residual that is
+    accepted, evaluations so far, and the plain ones of them."""
 
     size: Array
+    miss: Array
     merit: Array
     definite: Array
     pull: Array
