@@ -1,10 +1,13 @@
-"""What accuracy costs on seven arms by every model: tip, strain and gradient errors against times, alone and in a batch.
+"""What accuracy costs on seven arms by every model: tip, strain and gradient errors against times,
+alone and in a batch.
 
-    pip install . && python benchmarks/accuracy_cost.py [--scenes B2 ...] [--lanes 128] [--json FILE] [--plots FOLDER]
+    pip install . && python benchmarks/accuracy_cost.py [--scenes B2 ...] [--batch-size 128]
+        [--json FILE] [--plots FOLDER]
 
-Errors are the largest of eight shapes against 256 steps of order 6 (96 under loads), times medians of rounds in which all
-settings of a scene take turns. Scenes that the JSON file already holds are not measured again. The peer's points on B1 are those of
-`bench_peers.py`, from its own run: `--peers` names its JSON file.
+Errors are the largest of eight shapes against 256 steps of order 6 (96 under loads), times medians
+of rounds in which all settings of a scene take turns. Scenes that the JSON file already holds are
+not measured again. The peer's points on B1 are those of `bench_peers.py`, from its own run:
+`--peers` names its JSON file.
 """
 
 import argparse
@@ -20,10 +23,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import vsr_jax as vsr
-from vsr_jax import accuracy, accuracy_figures, paper
-from vsr_jax.timing import Timed, machine, take_turns
+from vsr_jax.studies import accuracy, accuracy_figures, paper
+from vsr_jax.studies.timing import Timed, machine, take_turns
 
-LANES = 128
+BATCH_SIZE = 128
 SPARSE = {
     *(("steps of order 6", steps) for steps in ("8", "16", "32")),
     ("steps of order 4", "32"),
@@ -39,8 +42,8 @@ FIGURES = {
 
 
 class Study(NamedTuple):
-    """An arm, the least and greatest inputs, a basis made for it, and whether only some of the settings are measured, where each takes
-    a minute to compile."""
+    """An arm, the least and greatest inputs, a basis made for it, and whether only some of the
+    settings are measured, where each takes a minute to compile."""
 
     scene: vsr.Scene
     low: tuple[float, ...]
@@ -61,16 +64,25 @@ def fast_helix() -> Study:
 
 
 def two_sections() -> Study:
-    """A base section twice as stiff as the tip's, a tendon that ends where it does, and one to the tip."""
-    arm = vsr.Rod(0.3, vsr.Circular(0.01), vsr.Material(vsr.Piecewise((0.15,), (8e5, 4e5)), poisson=0.45))
+    """A base section twice as stiff as the tip's, a tendon that ends where it does, and one to the
+    tip."""
+    arm = vsr.Rod(
+        0.3, vsr.Circular(0.01), vsr.Material(vsr.Piecewise((0.15,), (8e5, 4e5)), poisson=0.45)
+    )
     tendons = [vsr.Tendon(vsr.Parallel(0.0, 0.007), end=0.15), vsr.Tendon(vsr.Helix(0.007, 1.5))]
     return Study(vsr.Scene(arm, tendons), (0.5, 0.5), (4.0, 4.0))
 
 
 def loaded() -> Study:
     """A helical tendon under gravity and a force at the tip."""
-    arm = vsr.Rod(0.3, vsr.Circular(vsr.Taper(0.012, 0.010)), vsr.Material(8e5, poisson=0.45, density=1000.0))
-    scene = vsr.Scene(arm, [vsr.Tendon(vsr.Helix(0.007, 1.5))], [vsr.Gravity((0.0, 0.0, -9.81)), vsr.TipWrench(force=(0.0, 0.05, 0.0))])
+    arm = vsr.Rod(
+        0.3, vsr.Circular(vsr.Taper(0.012, 0.010)), vsr.Material(8e5, poisson=0.45, density=1000.0)
+    )
+    scene = vsr.Scene(
+        arm,
+        [vsr.Tendon(vsr.Helix(0.007, 1.5))],
+        [vsr.Gravity((0.0, 0.0, -9.81)), vsr.TipWrench(force=(0.0, 0.05, 0.0))],
+    )
     return Study(scene, (0.5,), (4.0,), sparse=True)
 
 
@@ -85,46 +97,82 @@ STUDIES: dict[str, Callable[[], Study]] = {
 }
 
 
-def run(name: str, lanes: int) -> list[accuracy.Row]:
+def run(name: str, batch_size: int) -> list[accuracy.Row]:
     """The rows of one scene, printed as they come."""
     study = STUDIES[name]()
-    inputs = jnp.asarray(np.random.default_rng(0).uniform(study.low, study.high, (lanes, len(study.low))))
+    inputs = jnp.asarray(
+        np.random.default_rng(0).uniform(study.low, study.high, (batch_size, len(study.low)))
+    )
     ways = accuracy.settings(study.scene, own=study.own)
     if study.sparse:
         ways = [way for way in ways if (way.family, way.label) in SPARSE]
-    rows = accuracy.measure(study.scene, inputs, ways, say=lambda way: print(f"{name}: {way}", file=sys.stderr))
-    print("\n".join([f"\n## {name}\n", *accuracy.table(rows), "", *accuracy.advice(rows)]), flush=True)
+    rows = accuracy.measure(
+        study.scene, inputs, ways, say=lambda way: print(f"{name}: {way}", file=sys.stderr)
+    )
+    print(
+        "\n".join([f"\n## {name}\n", *accuracy.table(rows), "", *accuracy.advice(rows)]), flush=True
+    )
     return rows
 
 
 def peers(path: str | None) -> dict[str, dict[str, Any]]:
-    """Times a shape [us] and largest errors of SoRoMoX on B1, from the JSON file of `bench_peers.py`."""
+    """Times a shape [us] and largest errors of SoRoMoX on B1, from the JSON file of
+    `bench_peers.py`."""
     if path is None:
         return {}
-    rows = [row for row in json.loads(Path(path).read_text())["scenes"]["B1"]["rows"] if row["tool"] == "SoRoMoX"]
+    rows = [
+        row
+        for row in json.loads(Path(path).read_text())["scenes"]["B1"]["rows"]
+        if row["tool"] == "SoRoMoX"
+    ]
     found: dict[str, list[tuple[float, float]]] = {}
     for row in rows:
         tool = "SoRoMoX, Newton" if "Newton" in row["setting"] else "SoRoMoX, BFGS"
         found.setdefault(tool, []).append((row["batch"]["median_us"] / 1024, row["tip_error_max"]))
-    return {"B1": {tool: tuple(zip(*sorted(points), strict=True)) for tool, points in found.items()}}
+    return {
+        "B1": {tool: tuple(zip(*sorted(points), strict=True)) for tool, points in found.items()}
+    }
 
 
-def asked_for(rounds: int = 30, lanes: int = 1024) -> list[dict[str, Any]]:
-    """What a millimetre, a micrometre and a nanometre cost on B2 where `vsr.plan` chooses: all timed in turn."""
+def asked_for(rounds: int = 30, batch_size: int = 1024) -> list[dict[str, Any]]:
+    """What a millimetre, a micrometre and a nanometre cost on B2 where `vsr.plan` chooses: all
+    timed in turn."""
     study = STUDIES["B2"]()
-    inputs = jnp.asarray(np.random.default_rng(0).uniform(study.low, study.high, (lanes, 2)))
+    inputs = jnp.asarray(np.random.default_rng(0).uniform(study.low, study.high, (batch_size, 2)))
     exact = _tips(study.scene, vsr.StrainDependent(256))(inputs)
-    plans = {tolerance: vsr.plan(study.scene, tolerance, (study.low, study.high)) for tolerance in accuracy.TOLERANCES}
+    plans = {
+        tolerance: vsr.plan(study.scene, tolerance, (study.low, study.high))
+        for tolerance in accuracy.TOLERANCES
+    }
     jobs = []
-    for plan in plans.values():  # several calls a turn: the first after the longest job's finds its memory given back
-        jobs.append(Timed(_tips(study.scene.astype(plan.dtype), plan.model), inputs.astype(plan.dtype), calls=5))
+    for plan in (
+        plans.values()
+    ):  # several calls a turn: the first after the longest job's finds its memory given back
+        jobs.append(
+            Timed(
+                _tips(study.scene.astype(plan.dtype), plan.model),
+                inputs.astype(plan.dtype),
+                calls=5,
+            )
+        )
     take_turns(jobs, rounds)
     found = []
     for (tolerance, plan), job in zip(plans.items(), jobs, strict=True):
         error = float(jnp.max(jnp.linalg.norm(job.output - exact, axis=1)))
-        found.append({"tolerance": tolerance, "steps": plan.model.steps, "dtype": plan.dtype, "error": error, **job.summary()})
-        median = job.summary()["median_us"] / lanes
-        print(f"{tolerance:g} m: {plan.model.steps} steps, {plan.dtype}, error {error:.1e} m, {median:.1f} us a shape")
+        found.append(
+            {
+                "tolerance": tolerance,
+                "steps": plan.model.steps,
+                "dtype": plan.dtype,
+                "error": error,
+                **job.summary(),
+            }
+        )
+        median = job.summary()["median_us"] / batch_size
+        print(
+            f"{tolerance:g} m: {plan.model.steps} steps, {plan.dtype}, error {error:.1e} m, "
+            f"{median:.1f} us a shape"
+        )
     return found
 
 
@@ -132,64 +180,93 @@ def _tips(scene: vsr.Scene, model: vsr.StrainDependent) -> Callable:
     return jax.vmap(lambda inputs: vsr.solve(scene, inputs, model=model).tip[:3, 3])
 
 
-def estimates(rounds: int = 30, lanes: int = 256) -> dict[str, Any]:
+def estimates(rounds: int = 30, batch_size: int = 256) -> dict[str, Any]:
     """What `eq.error` adds to a solve with the tip, at 16 steps, in a batch."""
     found = {}
     for name in ("B2", "loaded"):
         study, model = STUDIES[name](), vsr.StrainDependent(16)
-        inputs = jnp.asarray(np.random.default_rng(0).uniform(study.low, study.high, (lanes, len(study.low))))
+        inputs = jnp.asarray(
+            np.random.default_rng(0).uniform(study.low, study.high, (batch_size, len(study.low)))
+        )
 
-        def with_error(u: jax.Array, scene: vsr.Scene = study.scene, model: vsr.StrainDependent = model) -> tuple[jax.Array, jax.Array]:
+        def with_error(
+            u: jax.Array, scene: vsr.Scene = study.scene, model: vsr.StrainDependent = model
+        ) -> tuple[jax.Array, jax.Array]:
             eq = vsr.solve(scene, u, model=model)
             return eq.tip[:3, 3], eq.error.tip
 
         jobs = Timed(_tips(study.scene, model), inputs), Timed(jax.vmap(with_error), inputs)
         take_turns(jobs, rounds)
-        alone, both = (job.summary()["median_us"] / lanes for job in jobs)
+        alone, both = (job.summary()["median_us"] / batch_size for job in jobs)
         found[name] = {"tip_us": alone, "tip_and_error_us": both}
-        print(f"{name}: tip {alone:.1f} us a shape, with its error {both:.1f}: {both / alone:.2f} times")
+        print(
+            f"{name}: tip {alone:.1f} us a shape, with its error {both:.1f}: {both / alone:.2f} "
+            f"times"
+        )
     return found
 
 
 def stiff(calls: int = 5) -> dict[str, Any]:
-    """One solve of B2 by an implicit solver, for stiff equations, which these are not, and by an explicit one."""
+    """One solve of B2 by an implicit solver, for stiff equations, which these are not, and by an
+    explicit one."""
     study, found = STUDIES["B2"](), {}
     inputs = jnp.asarray(study.low)
     exact = vsr.solve(study.scene, inputs, model=vsr.StrainDependent(256)).tip[:3, 3]
     for solver in (diffrax.Dopri8(), diffrax.Kvaerno5()):
         model = vsr.Continuum(solver, 1e-5, 1e-7)
-        job = Timed(lambda u, model=model: vsr.solve(study.scene, u, model=model).tip[:3, 3], inputs, calls=calls)
+        job = Timed(
+            lambda u, model=model: vsr.solve(study.scene, u, model=model).tip[:3, 3],
+            inputs,
+            calls=calls,
+        )
         job.run()
         error = float(jnp.linalg.norm(job.output - exact))
         found[type(solver).__name__] = {"error": error, **job.summary()}
-        print(f"{type(solver).__name__}, rtol 1e-5: error {error:.1e} m, {job.summary()['median_us'] / 1e3:.1f} ms a shape")
+        print(
+            f"{type(solver).__name__}, rtol 1e-5: error {error:.1e} m, "
+            f"{job.summary()['median_us'] / 1e3:.1f} ms a shape"
+        )
     return found
 
 
-def draw(rows: dict[str, list[accuracy.Row]], folder: Path, others: dict[str, dict[str, Any]]) -> None:
+def draw(
+    rows: dict[str, list[accuracy.Row]], folder: Path, others: dict[str, dict[str, Any]]
+) -> None:
     for file, (error, time) in FIGURES.items():
         known = others if (error, time) == ("tip", "batch_us") else None
-        accuracy_figures.work_precision(rows, error=error, time=time, others=known).savefig(folder / f"{file}.png", dpi=130)
+        accuracy_figures.work_precision(rows, error=error, time=time, others=known).savefig(
+            folder / f"{file}.png", dpi=130
+        )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--scenes", nargs="+", choices=list(STUDIES), default=list(STUDIES))
-    parser.add_argument("--lanes", type=int, default=LANES)
+    parser.add_argument("--batch-size", type=int, default=BATCH_SIZE)
     parser.add_argument("--json", metavar="FILE")
     parser.add_argument("--plots", metavar="FOLDER")
     parser.add_argument("--peers", metavar="FILE")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     file = Path(options.json) if options.json else None
-    content = json.loads(file.read_text()) if file and file.exists() else {"machine": machine(), "jax": jax.__version__, "scenes": {}}
+    content = (
+        json.loads(file.read_text())
+        if file and file.exists()
+        else {"machine": machine(), "jax": jax.__version__, "scenes": {}}
+    )
     done: dict[str, Any] = content["scenes"]
     for name in options.scenes:
         if name not in done:
-            done[name] = [row._asdict() for row in run(name, options.lanes)]
+            done[name] = [row._asdict() for row in run(name, options.batch_size)]
             if file:
                 file.write_text(json.dumps(content, indent=1) + "\n")
-    for title, measured in (("asked for on B2", asked_for), ("price of an estimate", estimates), ("stiff solver on B2", stiff)):
+    for title, measured in (
+        ("asked for on B2", asked_for),
+        ("price of an estimate", estimates),
+        ("stiff solver on B2", stiff),
+    ):
         if title not in content:
             content[title] = measured()
     if file:

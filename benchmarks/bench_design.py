@@ -1,10 +1,12 @@
-"""Design by gradient: hidden routings found from the shapes they make, and what a step of the descent costs.
+"""Design by gradient: hidden routings found from the shapes they make, and what a step of the
+descent costs.
 
     pip install . && python benchmarks/bench_design.py [--starts 10] [--arms 5] [--json FILE]
 
-Two helical threads, of which radius, angle and phase are hidden; known are ten points of the arm's axis under five sets of
-tensions. For each random start: how far the threads found lie from the hidden ones at most. All starts run side by side in one call
-of `vsr.design`, whose time is told with compiling in it for the first arm, without for the others. Then the time of one step against
+Two helical threads, of which radius, angle and phase are hidden; known are ten points of the arm's
+axis under five sets of tensions. For each random start: how far the threads found lie from the
+hidden ones at most. All starts run side by side in one call of `vsr.design`, whose time is told
+with compiling in it for the first arm, without for the others. Then the time of one step against
 that of the same solves alone, taken in turn.
 """
 
@@ -19,9 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import vsr_jax as vsr
-from vsr_jax.descent import adam, begin, descend, weight
-from vsr_jax.problem import posed
-from vsr_jax.timing import Timed, machine, take_turns
+from vsr_jax.optimization.descent import adam, begin, descend, weight
+from vsr_jax.optimization.problem import posed
+from vsr_jax.studies.timing import Timed, machine, take_turns
 
 MODEL = vsr.StrainDependent(12)
 LENGTH, STEPS, TRIED, WITHIN = 0.75, 400, 64, 1e-4
@@ -36,7 +38,9 @@ FREE = {
 def arm(helices: Any) -> vsr.Scene:
     """An arm with threads of given radius, angle and phase."""
     rod = vsr.Rod(LENGTH, vsr.Circular(vsr.Taper(0.012, 0.010)), vsr.Material(5.93e5, shear=2.0e5))
-    return vsr.Scene(rod, [vsr.Tendon(vsr.Helix(radius, angle, phase=phase)) for radius, angle, phase in helices])
+    return vsr.Scene(
+        rod, [vsr.Tendon(vsr.Helix(radius, angle, phase=phase)) for radius, angle, phase in helices]
+    )
 
 
 def unknowing() -> vsr.Scene:
@@ -44,32 +48,59 @@ def unknowing() -> vsr.Scene:
 
 
 def hidden(seed: int) -> vsr.Scene:
-    return arm(np.random.default_rng(seed).uniform((0.004, 1.49, -np.pi), (0.008, 1.55, np.pi), (2, 3)))
+    return arm(
+        np.random.default_rng(seed).uniform((0.004, 1.49, -np.pi), (0.008, 1.55, np.pi), (2, 3))
+    )
 
 
 def shapes(scene: vsr.Scene) -> vsr.objective.CurveError:
     """The objective to make the shapes of a scene."""
     X = jnp.asarray(LENGTH * np.arange(1, 11) / 10)
-    return vsr.objective.CurveError(jax.vmap(lambda u: vsr.solve(scene, u, model=MODEL).position(X))(jnp.asarray(TENSIONS)), X, local=True)
+    return vsr.objective.CurveError(
+        jax.vmap(lambda u: vsr.solve(scene, u, model=MODEL).position(X))(jnp.asarray(TENSIONS)),
+        X,
+        local=True,
+    )
 
 
 def paths(scene: vsr.Scene) -> np.ndarray:
     """Where the threads cross the sections [m], shape (threads, stations, 2)."""
     X = jnp.linspace(0, LENGTH, 101)
-    return np.asarray([jnp.stack(jax.vmap(actuator.routing)(X), axis=-1) for actuator in scene.actuators])
+    return np.asarray(
+        [jnp.stack(jax.vmap(actuator.routing)(X), axis=-1) for actuator in scene.actuators]
+    )
 
 
 def found(seed: int, starts: int) -> dict[str, Any]:
-    """How far the threads of each random start come to lie from those of a hidden arm; the start at the given scene is left out."""
+    """How far the threads of each random start come to lie from those of a hidden arm; the start at
+    the given scene is left out."""
     secret = hidden(seed)
     wanted = shapes(secret)
     start = time.perf_counter()
     result = vsr.design(
-        unknowing(), FREE, wanted, TENSIONS, model=MODEL, starts=starts + 1, steps=STEPS, tried=TRIED, seed=seed, progress=False
+        unknowing(),
+        FREE,
+        wanted,
+        TENSIONS,
+        model=MODEL,
+        starts=starts + 1,
+        steps=STEPS,
+        candidates=TRIED,
+        seed=seed,
+        progress=False,
     )
     seconds = time.perf_counter() - start
-    off = [float(np.max(np.linalg.norm(paths(one.scene) - paths(secret), axis=-1))) for one in result.starts[1:]]
-    return {"arm": seed, "seconds": seconds, "found": sum(x <= WITHIN for x in off), "of": starts, "off": off}
+    off = [
+        float(np.max(np.linalg.norm(paths(one.scene) - paths(secret), axis=-1)))
+        for one in result.starts[1:]
+    ]
+    return {
+        "arm": seed,
+        "seconds": seconds,
+        "found": sum(x <= WITHIN for x in off),
+        "of": starts,
+        "off": off,
+    }
 
 
 def step_cost(starts: int, rounds: int) -> dict[str, Any]:
@@ -82,11 +113,18 @@ def step_cost(starts: int, rounds: int) -> dict[str, Any]:
     alone = Timed(lambda z: jax.vmap(lambda z: problem.loss(z, penalty)[0])(z), states.z)
     take_turns([step, alone], rounds)
     ratio = step.summary()["median_us"] / alone.summary()["median_us"]
-    return {"starts": starts, "step / solves": ratio, "step": step.summary(), "solves": alone.summary()}
+    return {
+        "starts": starts,
+        "step / solves": ratio,
+        "step": step.summary(),
+        "solves": alone.summary(),
+    }
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--starts", type=int, default=10)
     parser.add_argument("--arms", type=int, default=5, help="hidden arms (default: %(default)s)")
     parser.add_argument("--rounds", type=int, default=30)
@@ -95,10 +133,16 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     arms = [found(seed, options.starts) for seed in range(options.arms)]
     for one in arms:
-        print(f"arm {one['arm']}: {one['found']} of {one['of']} starts within {WITHIN:g} m, {one['seconds']:.1f} s")
+        print(
+            f"arm {one['arm']}: {one['found']} of {one['of']} starts within {WITHIN:g} m, "
+            f"{one['seconds']:.1f} s"
+        )
     costs = [step_cost(starts, options.rounds) for starts in (1, options.starts)]
     for cost in costs:
-        print(f"{cost['starts']} starts: a step takes {cost['step / solves']:.2f} times its solves ({cost['step']['median_us']:.0f} us)")
+        print(
+            f"{cost['starts']} starts: a step takes {cost['step / solves']:.2f} times its solves "
+            f"({cost['step']['median_us']:.0f} us)"
+        )
     if options.json:
         record = {"machine": machine(), "jax": jax.__version__, "arms": arms, "steps": costs}
         Path(options.json).write_text(json.dumps(record, indent=1) + "\n")

@@ -1,9 +1,11 @@
-"""What each effect of a scene costs: operations, compile time, and the times of a solve, single and in a batch of 1,024.
+"""What each effect of a scene costs: operations, compile time, and the times of a solve, single and
+in a batch of 1,024.
 
     python benchmarks/bench_effects.py [--json FILE] [--rounds N]
 
-One arm with two tendons to which the effects are added one after another (`vsr_jax.effects`), float64, all solves timed in turn
-in one run. `vsr-jax effects` prints the same table for a smaller batch.
+One arm with two tendons to which the effects are added one after another
+(`vsr_jax.studies.effects`), float64, all solves timed in turn in one run. `vsr-jax effects` prints
+the same table for a smaller batch.
 """
 
 import argparse
@@ -12,24 +14,33 @@ from pathlib import Path
 
 import jax
 
-from vsr_jax import effects
-from vsr_jax.timing import machine
+from vsr_jax.studies import effects
+from vsr_jax.studies.timing import machine
 
 BATCH = 1024
 
 
 def main() -> None:
     """Run the benchmark and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--json", type=Path, help="write the figures here too")
     parser.add_argument("--rounds", type=int, default=15, help="how often each solve is timed (15)")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    print(f"{machine()}, jax {jax.__version__}; 16 steps of order 6, {BATCH} in a batch; median (10 %-90 %), x: to the row above")
+    print(
+        f"{machine()}, jax {jax.__version__}; 16 steps of order 6, {BATCH} in a batch; median (10 "
+        f"%-90 %), x: to the row above"
+    )
     costs = effects.measure(BATCH, options.rounds)
     print("\n".join(effects.table(costs)))
     if options.json:
-        report = {"machine": machine(), "jax": jax.__version__, "rows": [cost._asdict() for cost in costs]}
+        report = {
+            "machine": machine(),
+            "jax": jax.__version__,
+            "rows": [cost._asdict() for cost in costs],
+        }
         options.json.parent.mkdir(parents=True, exist_ok=True)
         options.json.write_text(json.dumps(report, indent=1) + "\n")
 

@@ -1,15 +1,20 @@
-"""vsr_jax and its peers on the same scenes, in one process: an arm with a parallel thread, with a helical one, and that with loads.
+"""vsr_jax and its peers on the same scenes, in one process: an arm with a parallel thread, with a
+helical one, and that with loads.
 
-    pip install ".[bench]" && python benchmarks/bench_peers.py [--scenes A1 B1 loaded] [--slow] [--json FILE] [--plot FILE]
+    pip install ".[bench]" && python benchmarks/bench_peers.py [--scenes A1 B1 loaded] [--slow]
+        [--json FILE] [--plot FILE]
 
-1,024 tensions drawn uniformly from [-15, 0] N (the sign of the paper: negative pulls), float64, each shape solved on its own from a
-cold start. Tip errors are distances to vsr_jax at 96 steps of order 6, which is itself held against an independent solution of the
-loaded scene. "gradient" is the derivative of the tip's height, summed over the batch, by the radius, angle and phase of the thread.
-All functions are compiled first and then timed in rounds, one after another, so that a busy machine is busy for both tools alike.
+1,024 tensions drawn uniformly from [-15, 0] N (the sign of the paper: negative pulls), float64,
+each shape solved on its own from a cold start. Tip errors are distances to vsr_jax at 96 steps of
+order 6, which is itself held against an independent solution of the loaded scene. "gradient" is the
+derivative of the tip's height, summed over the batch, by the radius, angle and phase of the thread.
+All functions are compiled first and then timed in rounds, one after another, so that a busy machine
+is busy for both tools alike.
 
-How SoRoMoX is used, which has no static solver, is told in `peer_soromox`. `--slow` adds single solves, at -5 N, by SciPy's
-`solve_bvp` (`peer_scipy`) and by PyElastica's dynamics (`peer_elastica`, arms without loads). `--formulations` times the ways in which
-SoRoMoX was tried on the loaded scene.
+How SoRoMoX is used, which has no static solver, is told in `peer_soromox`. `--slow` adds single
+solves, at -5 N, by SciPy's `solve_bvp` (`peer_scipy`) and by PyElastica's dynamics
+(`peer_elastica`, arms without loads). `--formulations` times the ways in which SoRoMoX was tried on
+the loaded scene.
 """
 
 import argparse
@@ -30,7 +35,7 @@ from matplotlib.figure import Figure
 from peer_scenes import CASES, Case, our_scene
 
 import vsr_jax as vsr
-from vsr_jax.timing import Timed, machine, take_turns
+from vsr_jax.studies.timing import Timed, machine, take_turns
 
 BATCH = 1024
 SINGLES = 5
@@ -61,7 +66,9 @@ def our_jobs(case: Case, steps: int, order: int, taus: jax.Array) -> tuple[str, 
     }
 
 
-def their_jobs(peer: Any, case: Case, setting: tuple, taus: jax.Array) -> tuple[str, dict[str, Timed]]:
+def their_jobs(
+    peer: Any, case: Case, setting: tuple, taus: jax.Array
+) -> tuple[str, dict[str, Timed]]:
     """Name and compiled functions of one setting of SoRoMoX."""
     chosen = peer.Setting(*setting)
     arm, path = peer.build(chosen, case.numbers)
@@ -74,7 +81,9 @@ def their_jobs(peer: Any, case: Case, setting: tuple, taus: jax.Array) -> tuple[
         return jax.vmap(partial(single, arm, path))(taus)
 
     def gradient(arm: Any, path: Any, taus: jax.Array) -> Any:
-        each = jax.vmap(lambda tau: peer.height_gradient(arm, path, tau, chosen.tolerance, solve))(taus)
+        each = jax.vmap(lambda tau: peer.height_gradient(arm, path, tau, chosen.tolerance, solve))(
+            taus
+        )
         return jax.tree.map(lambda leaf: jnp.sum(leaf, 0), each)
 
     return str(chosen), {
@@ -85,103 +94,174 @@ def their_jobs(peer: Any, case: Case, setting: tuple, taus: jax.Array) -> tuple[
 
 
 def errors(tips: Any, truth: np.ndarray) -> dict[str, Any]:
-    """Largest and median distance to the truth [m] among the shapes that came back, and how many did not."""
+    """Largest and median distance to the truth [m] among the shapes that came back, and how many
+    did not."""
     distance = np.linalg.norm(np.asarray(tips) - truth, axis=1)
     found = distance[np.isfinite(distance)]
-    worst, median = (float(np.max(found)), float(np.median(found))) if len(found) else (np.inf, np.inf)
-    return {"tip_error_max": worst, "tip_error_median": median, "lost": int(len(distance) - len(found))}
+    worst, median = (
+        (float(np.max(found)), float(np.median(found))) if len(found) else (np.inf, np.inf)
+    )
+    return {
+        "tip_error_max": worst,
+        "tip_error_median": median,
+        "lost": int(len(distance) - len(found)),
+    }
 
 
-def measure(jobs: list[tuple[str, str, dict[str, Timed]]], truth: np.ndarray, rounds: int) -> list[dict[str, Any]]:
+def measure(
+    jobs: list[tuple[str, str, dict[str, Timed]]], truth: np.ndarray, rounds: int
+) -> list[dict[str, Any]]:
     """Rows of the table: all jobs timed in turn, round after round."""
     take_turns((job for _, _, row in jobs for job in row.values()), rounds)
     rows = []
     for tool, name, row in jobs:
-        entry: dict[str, Any] = {"tool": tool, "setting": name, **errors(row["batch"].output, truth)}
+        entry: dict[str, Any] = {
+            "tool": tool,
+            "setting": name,
+            **errors(row["batch"].output, truth),
+        }
         entry |= {kind: job.summary() for kind, job in row.items()}
-        entry["gradient_by_helix"] = [float(np.ravel(leaf)[0]) for leaf in jax.tree.leaves(row["gradient"].output)]
+        entry["gradient_by_helix"] = [
+            float(np.ravel(leaf)[0]) for leaf in jax.tree.leaves(row["gradient"].output)
+        ]
         rows.append(entry)
     return rows
 
 
 def rate(entry: dict[str, float]) -> str:
     """Shapes a second, with their spread, as text."""
-    return "{:.0f} ({:.0f}-{:.0f})".format(*(1e6 * BATCH / entry[key] for key in ("median_us", "high_us", "low_us")))
+    return "{:.0f} ({:.0f}-{:.0f})".format(
+        *(1e6 * BATCH / entry[key] for key in ("median_us", "high_us", "low_us"))
+    )
 
 
 def print_rows(rows: list[dict[str, Any]]) -> None:
     """Table of all settings."""
-    print("| tool | setting | tip error max [m] | median | lost | single [us] | shapes/s, 1,024 | gradients/s | compile [s] |")
+    print(
+        "| tool | setting | tip error max [m] | median | lost | single [us] | shapes/s, 1,024 | "
+        "gradients/s | compile [s] |"
+    )
     print("|" + "---|" * 9)
     for row in rows:
         single = "{median_us:.0f} ({low_us:.0f}-{high_us:.0f})".format(**row["single"])
-        compiles = " / ".join(f"{row[kind]['compile_s']:.1f}" for kind in ("single", "batch", "gradient"))
-        cells = [row["tool"], row["setting"], f"{row['tip_error_max']:.1e}", f"{row['tip_error_median']:.1e}", str(row["lost"])]
-        print(f"| {' | '.join(cells)} | {single} | {rate(row['batch'])} | {rate(row['gradient'])} | {compiles} |")
+        compiles = " / ".join(
+            f"{row[kind]['compile_s']:.1f}" for kind in ("single", "batch", "gradient")
+        )
+        cells = [
+            row["tool"],
+            row["setting"],
+            f"{row['tip_error_max']:.1e}",
+            f"{row['tip_error_median']:.1e}",
+            str(row["lost"]),
+        ]
+        print(
+            f"| {' | '.join(cells)} | {single} | {rate(row['batch'])} | {rate(row['gradient'])} | "
+            f"{compiles} |"
+        )
 
 
 def compare(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """For each setting of the peer, our fastest that loses no shape and errs no more, in the largest and in the median error."""
+    """For each setting of the peer, our fastest that loses no shape and errs no more, in the
+    largest and in the median error."""
     pairs = []
     for theirs in (row for row in rows if row["tool"] != "vsr_jax"):
         able = [row for row in rows if row["tool"] == "vsr_jax" and not row["lost"]]
-        able = [row for row in able if all(row[key] <= theirs[key] for key in ("tip_error_max", "tip_error_median"))]
+        able = [
+            row
+            for row in able
+            if all(row[key] <= theirs[key] for key in ("tip_error_max", "tip_error_median"))
+        ]
         pair: dict[str, Any] = {"theirs": theirs["setting"], "ours": None}
         if able:
             ours = min(able, key=lambda row: row["batch"]["median_us"])
-            ratios = {kind: theirs[kind]["median_us"] / ours[kind]["median_us"] for kind in ("single", "batch", "gradient")}
-            pair |= {"ours": ours["setting"], **ratios, "batch_cpu": theirs["batch"]["cpu_us"] / ours["batch"]["cpu_us"]}
+            ratios = {
+                kind: theirs[kind]["median_us"] / ours[kind]["median_us"]
+                for kind in ("single", "batch", "gradient")
+            }
+            pair |= {
+                "ours": ours["setting"],
+                **ratios,
+                "batch_cpu": theirs["batch"]["cpu_us"] / ours["batch"]["cpu_us"],
+            }
         pairs.append(pair)
     return pairs
 
 
 def print_pairs(pairs: list[dict[str, Any]]) -> None:
     """Table of the comparison at equal or better error."""
-    print("\nvsr_jax over SoRoMoX at equal or better tip error, largest and median; times as many a second:\n")
+    print(
+        "\nvsr_jax over SoRoMoX at equal or better tip error, largest and median; times as many a "
+        "second:\n"
+    )
     print("| SoRoMoX | vsr_jax | single | 1,024 in a batch | the same, CPU time | their gradient |")
     print("|" + "---|" * 6)
     for pair in pairs:
-        cells = [f"{pair[kind]:.1f}" if pair["ours"] else "-" for kind in ("single", "batch", "batch_cpu", "gradient")]
+        cells = [
+            f"{pair[kind]:.1f}" if pair["ours"] else "-"
+            for kind in ("single", "batch", "batch_cpu", "gradient")
+        ]
         print(f"| {pair['theirs']} | {pair['ours'] or 'none as accurate'} | {' | '.join(cells)} |")
 
 
-def formulations(peer: Any, taus: jax.Array, truth: np.ndarray, rounds: int, lanes: int = 64) -> list[dict[str, Any]]:
+def formulations(
+    peer: Any, taus: jax.Array, truth: np.ndarray, rounds: int, batch_size: int = 64
+) -> list[dict[str, Any]]:
     """Rows for the ways of posing the statics to SoRoMoX, at one setting, in a small batch."""
     chosen = peer.Setting(*CASES["loaded"].theirs[1])
     arm, path = peer.build(chosen, CASES["loaded"].numbers)
     rows = []
-    print(f"\nSoRoMoX's formulations, {chosen}, {lanes} in a batch:\n")
+    print(f"\nSoRoMoX's formulations, {chosen}, {batch_size} in a batch:\n")
     print("| formulation | tip error max [m] | median | us a shape | compile [s] |")
     print("|" + "---|" * 5)
     for name, solve in peer.FORMULATIONS.items():
 
         def tips(arm: Any, path: Any, taus: jax.Array, solve: Callable = solve) -> jax.Array:
-            return jax.vmap(lambda tau: peer.tip(arm, solve(arm, path, tau, chosen.tolerance)))(taus)
+            return jax.vmap(lambda tau: peer.tip(arm, solve(arm, path, tau, chosen.tolerance)))(
+                taus
+            )
 
-        job = Timed(tips, arm, path, taus[:lanes])
+        job = Timed(tips, arm, path, taus[:batch_size])
         take_turns([job], rounds)
-        row = {"formulation": name, "lanes": lanes, **errors(job.output, truth[:lanes]), "batch": job.summary()}
-        low, median, high = (row["batch"][key] / lanes for key in ("low_us", "median_us", "high_us"))
+        row = {
+            "formulation": name,
+            "batch_size": batch_size,
+            **errors(job.output, truth[:batch_size]),
+            "batch": job.summary(),
+        }
+        low, median, high = (
+            row["batch"][key] / batch_size for key in ("low_us", "median_us", "high_us")
+        )
         spread = f"{median:.0f} ({low:.0f}-{high:.0f})"
-        print(f"| {name} | {row['tip_error_max']:.1e} | {row['tip_error_median']:.1e} | {spread} | {job.compile_s:.1f} |", flush=True)
+        print(
+            f"| {name} | {row['tip_error_max']:.1e} | {row['tip_error_median']:.1e} | {spread} | "
+            f"{job.compile_s:.1f} |",
+            flush=True,
+        )
         rows.append(row)
     return rows
 
 
 def truths(case: Case, taus: jax.Array) -> tuple[np.ndarray, float | None]:
-    """Tips [m] at all tensions by vsr_jax at high resolution, and how far its tip is from the independent one [m]."""
+    """Tips [m] at all tensions by vsr_jax at high resolution, and how far its tip is from the
+    independent one [m]."""
     tips = jax.jit(partial(our_tips, vsr.StrainDependent(*TRUTH)))
-    found = np.asarray(tips(our_scene(case.numbers), jnp.append(taus, jnp.array([[case.tension]]), axis=0)))
-    return found, None if case.tip is None else float(np.linalg.norm(found[-1] - np.array(case.tip)))
+    found = np.asarray(
+        tips(our_scene(case.numbers), jnp.append(taus, jnp.array([[case.tension]]), axis=0))
+    )
+    return found, None if case.tip is None else float(
+        np.linalg.norm(found[-1] - np.array(case.tip))
+    )
 
 
 def slow_peers(name: str, case: Case, truth: np.ndarray) -> list[dict[str, Any]]:
-    """Single solves by SciPy, and by PyElastica for an arm without loads: seconds, and distance of the tip [m]."""
+    """Single solves by SciPy, and by PyElastica for an arm without loads: seconds, and distance of
+    the tip [m]."""
     from peer_scipy import Arm
 
     arm = Arm(case.numbers)
     ways: dict[tuple[str, str], Callable] = {
-        ("SciPy solve_bvp", f"tol {tol:g}"): partial(arm.tip, case.tension, tol) for tol in (1e-4, 1e-6)
+        ("SciPy solve_bvp", f"tol {tol:g}"): partial(arm.tip, case.tension, tol)
+        for tol in (1e-4, 1e-6)
     }
     if case.numbers["gravity"] is None:
         import peer_elastica
@@ -193,8 +273,20 @@ def slow_peers(name: str, case: Case, truth: np.ndarray) -> list[dict[str, Any]]
     for (tool, setting), way in ways.items():
         start = time.perf_counter()
         error = float(np.linalg.norm(way() - truth))
-        rows.append({"scene": name, "tool": tool, "setting": setting, "seconds": time.perf_counter() - start, "tip_error": error})
-        print(f"{tool}, {setting}: {rows[-1]['seconds']:.2f} s for one shape, tip error {error:.1e} m", flush=True)
+        rows.append(
+            {
+                "scene": name,
+                "tool": tool,
+                "setting": setting,
+                "seconds": time.perf_counter() - start,
+                "tip_error": error,
+            }
+        )
+        print(
+            f"{tool}, {setting}: {rows[-1]['seconds']:.2f} s for one shape, tip error {error:.1e} "
+            f"m",
+            flush=True,
+        )
     return rows
 
 
@@ -203,7 +295,10 @@ def load_peer() -> Any:
     try:
         import peer_soromox
     except ModuleNotFoundError as error:
-        print(f"bench_peers needs {error.name}, which is not installed: pip install '.[bench]'", file=sys.stderr)
+        print(
+            f"bench_peers needs {error.name}, which is not installed: pip install '.[bench]'",
+            file=sys.stderr,
+        )
         sys.exit(2)
     return peer_soromox
 
@@ -214,7 +309,11 @@ def run(name: str, peer: Any, taus: jax.Array, rounds: int, slow: bool) -> dict[
     truth, miss = truths(case, taus)
     print(f"\n## {name}: {case.about}\n")
     if miss is not None:
-        print(f"vsr_jax at {TRUTH[0]} steps of order {TRUTH[1]} is {miss:.1e} m from the independent tip at {case.tension} N\n", flush=True)
+        print(
+            f"vsr_jax at {TRUTH[0]} steps of order {TRUTH[1]} is {miss:.1e} m from the "
+            f"independent tip at {case.tension} N\n",
+            flush=True,
+        )
     jobs = [("SoRoMoX", *their_jobs(peer, case, setting, taus)) for setting in case.theirs]
     jobs += [("vsr_jax", *our_jobs(case, *resolution, taus)) for resolution in case.ours]
     rows = measure(jobs, truth[:-1], rounds)
@@ -229,15 +328,33 @@ def draw(report: dict[str, Any], path: str) -> None:
     """Shapes a second over tip error, a panel for each scene."""
     scenes = report["scenes"]
     figure = Figure(figsize=(4 * len(scenes), 3.8), layout="constrained")
-    for ax, (name, found) in zip(np.atleast_1d(figure.subplots(1, len(scenes))), scenes.items(), strict=True):
+    for ax, (name, found) in zip(
+        np.atleast_1d(figure.subplots(1, len(scenes))), scenes.items(), strict=True
+    ):
         for tool, colour in COLOURS.items():
             newton = tool.endswith("Newton")
-            rows = [row for row in found["rows"] if tool.startswith(row["tool"]) and ("Newton" in row["setting"]) == newton]
+            rows = [
+                row
+                for row in found["rows"]
+                if tool.startswith(row["tool"]) and ("Newton" in row["setting"]) == newton
+            ]
             rows.sort(key=lambda row: row["tip_error_max"])
             if rows:
                 x = [max(row["tip_error_max"], 1e-16) for row in rows]
-                ax.plot(x, [1e6 * BATCH / row["batch"]["median_us"] for row in rows], "o-", color=colour, label=tool)
-        ax.set(xscale="log", yscale="log", xlabel="largest tip error [m]", ylabel="shapes a second", title=name)
+                ax.plot(
+                    x,
+                    [1e6 * BATCH / row["batch"]["median_us"] for row in rows],
+                    "o-",
+                    color=colour,
+                    label=tool,
+                )
+        ax.set(
+            xscale="log",
+            yscale="log",
+            xlabel="largest tip error [m]",
+            ylabel="shapes a second",
+            title=name,
+        )
         ax.grid(alpha=0.3)
         ax.legend()
     figure.savefig(path, dpi=150)
@@ -245,17 +362,35 @@ def draw(report: dict[str, Any], path: str) -> None:
 
 def main() -> None:
     """Run the benchmark and print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", nargs="+", choices=tuple(CASES), default=tuple(CASES), help="which of them (default: all)")
-    parser.add_argument("--slow", action="store_true", help="single solves by SciPy and PyElastica too")
-    parser.add_argument("--formulations", action="store_true", help="time the ways of posing the loaded statics to SoRoMoX as well")
-    parser.add_argument("--rounds", type=int, default=5, help="how often each function is timed (5)")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--scenes",
+        nargs="+",
+        choices=tuple(CASES),
+        default=tuple(CASES),
+        help="which of them (default: all)",
+    )
+    parser.add_argument(
+        "--slow", action="store_true", help="single solves by SciPy and PyElastica too"
+    )
+    parser.add_argument(
+        "--formulations",
+        action="store_true",
+        help="time the ways of posing the loaded statics to SoRoMoX as well",
+    )
+    parser.add_argument(
+        "--rounds", type=int, default=5, help="how often each function is timed (5)"
+    )
     parser.add_argument("--json", type=Path, help="write the figures here too")
     parser.add_argument("--plot", metavar="FILE", help="draw them")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     peer = load_peer()
-    versions = {name: importlib.metadata.version(name) for name in ("jax", "soromox")} | {"vsr_jax": vsr.__version__}
+    versions = {name: importlib.metadata.version(name) for name in ("jax", "soromox")} | {
+        "vsr_jax": vsr.__version__
+    }
     print(f"{machine()}, {', '.join(f'{name} {number}' for name, number in versions.items())}")
     taus = jnp.asarray(np.random.default_rng(0).uniform(-15, 0, (BATCH, 1)))
     report: dict[str, Any] = {"machine": machine(), "versions": versions, "scenes": {}}
@@ -263,7 +398,9 @@ def main() -> None:
         report["scenes"][name] = run(name, peer, taus, options.rounds, options.slow)
         jax.clear_caches()
     if options.formulations:
-        report["formulations"] = formulations(peer, taus, truths(CASES["loaded"], taus)[0][:-1], options.rounds)
+        report["formulations"] = formulations(
+            peer, taus, truths(CASES["loaded"], taus)[0][:-1], options.rounds
+        )
     if options.json:
         options.json.parent.mkdir(parents=True, exist_ok=True)
         options.json.write_text(json.dumps(report, indent=1) + "\n")

@@ -1,9 +1,11 @@
-"""Inverse statics in a batch: 1,024 targets that inputs drawn at random have reached, for three arms.
+"""Inverse statics in a batch: 1,024 targets that inputs drawn at random have reached, for three
+arms.
 
     pip install . && python benchmarks/bench_reach.py [--targets 1024] [--json FILE]
 
-For each arm: how many targets are reached within a millionth of a metre, the largest miss, compile time and targets a second; and the
-same for targets beyond the arm's length, none of which may be called reached.
+For each arm: how many targets are reached within a millionth of a metre, the largest miss, compile
+time and targets a second; and the same for targets beyond the arm's length, none of which may be
+called reached.
 """
 
 import argparse
@@ -17,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import vsr_jax as vsr
-from vsr_jax.timing import Timed, machine, take_turns
+from vsr_jax.studies.timing import Timed, machine, take_turns
 
 MODEL = vsr.StrainDependent(12)
 MOST, MISS = 12.0, 1e-6
@@ -33,11 +35,17 @@ def arms() -> dict[str, vsr.Scene]:
         return [vsr.Tendon(vsr.Parallel(0.005 * np.cos(a), 0.005 * np.sin(a))) for a in angles]
 
     helices = [vsr.Tendon(vsr.Helix(0.005, angle)) for angle in (1.529, 1.487)]
-    return {"three tendons": vsr.Scene(rod, ring(3)), "four tendons": vsr.Scene(rod, ring(4)), "two helices": vsr.Scene(rod, helices)}
+    return {
+        "three tendons": vsr.Scene(rod, ring(3)),
+        "four tendons": vsr.Scene(rod, ring(4)),
+        "two helices": vsr.Scene(rod, helices),
+    }
 
 
 def run(scene: vsr.Scene, number: int, rounds: int) -> dict[str, Any]:
-    inputs = jnp.asarray(np.random.default_rng(0).uniform(0.1, MOST, (number, len(scene.actuators))))
+    inputs = jnp.asarray(
+        np.random.default_rng(0).uniform(0.1, MOST, (number, len(scene.actuators)))
+    )
     tips = jax.vmap(lambda u: vsr.solve(scene, u, model=MODEL).tip[:3, 3])(inputs)
 
     def reach(target: jax.Array) -> vsr.Reach:
@@ -53,7 +61,9 @@ def run(scene: vsr.Scene, number: int, rounds: int) -> dict[str, Any]:
         "targets": number,
         "reached": int(jnp.sum(found.reached)),
         "largest miss": float(jnp.max(found.miss)),
-        "effort, by that of the inputs drawn": float(jnp.median(jnp.linalg.norm(found.inputs, axis=1) / jnp.linalg.norm(inputs, axis=1))),
+        "effort, by that of the inputs drawn": float(
+            jnp.median(jnp.linalg.norm(found.inputs, axis=1) / jnp.linalg.norm(inputs, axis=1))
+        ),
         "out of reach, called reached": int(jnp.sum(far.reached)),
         "targets a second": 1e6 * number / times["median_us"],
         "out of reach, targets a second": number / beyond_s,
@@ -62,7 +72,9 @@ def run(scene: vsr.Scene, number: int, rounds: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--targets", type=int, default=1024)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--json", metavar="FILE")
@@ -71,9 +83,15 @@ def main() -> None:
     results = {}
     for name, scene in arms().items():
         results[name] = run(scene, options.targets, options.rounds)
-        print(f"{name}: " + ", ".join(f"{key} {value:.4g}" for key, value in results[name].items()), flush=True)
+        print(
+            f"{name}: " + ", ".join(f"{key} {value:.4g}" for key, value in results[name].items()),
+            flush=True,
+        )
     if options.json:
-        Path(options.json).write_text(json.dumps({"machine": machine(), "jax": jax.__version__, "arms": results}, indent=1) + "\n")
+        Path(options.json).write_text(
+            json.dumps({"machine": machine(), "jax": jax.__version__, "arms": results}, indent=1)
+            + "\n"
+        )
 
 
 if __name__ == "__main__":

@@ -1,9 +1,11 @@
-"""Time of a solve: compile, single, 1,024 in a batch and the batched gradient, in float32 and float64, in one run.
+"""Time of a solve: compile, single, 1,024 in a batch and the batched gradient, in float32 and
+float64, in one run.
 
     python benchmarks/bench_solve.py [--json FILE] [--cold]
 
-The batch draws tensions uniformly from [-15, 0] N. "gradient" is the derivative of a tip coordinate, summed over the
-batch, with respect to every number of every routing. `--cold` adds the time from a cold process to the first tip of B1.
+The batch draws tensions uniformly from [-15, 0] N. "gradient" is the derivative of a tip
+coordinate, summed over the batch, with respect to every number of every routing. `--cold` adds the
+time from a cold process to the first tip of B1.
 """
 
 import argparse
@@ -20,8 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import vsr_jax as vsr
-from vsr_jax import paper
-from vsr_jax.timing import Timed, machine, take_turns
+from vsr_jax.studies import paper
+from vsr_jax.studies.timing import Timed, machine, take_turns
 
 BATCH = 1024
 REPEATS = 15
@@ -64,7 +66,14 @@ def measure(name: str, scene: vsr.Scene, model: vsr.StrainDependent, dtype: str)
         return jnp.sum(tips(eqx.tree_at(lambda s: s.actuators, scene, actuators), taus)[:, 2])
 
     nodes = model.steps * model.order // 2
-    row = {"scene": name, "threads": threads, "steps": model.steps, "order": model.order, "nodes": nodes, "dtype": dtype}
+    row = {
+        "scene": name,
+        "threads": threads,
+        "steps": model.steps,
+        "order": model.order,
+        "nodes": nodes,
+        "dtype": dtype,
+    }
     row["single"] = timed(tip, scene, taus[0])
     row["strains only"] = timed(strains, scene, taus)
     row["batch"] = timed(tips, scene, taus)
@@ -74,10 +83,22 @@ def measure(name: str, scene: vsr.Scene, model: vsr.StrainDependent, dtype: str)
 
 
 def cold_start(runs: int = 3) -> dict[str, float]:
-    """Medians of import, build and solve to the first tip of B1, each run in a process of its own [s]."""
-    rows = [subprocess.run([sys.executable, "-c", COLD], capture_output=True, text=True, check=True).stdout.split() for _ in range(runs)]
+    """Medians of import, build and solve to the first tip of B1, each run in a process of its own
+    [s]."""
+    rows = [
+        subprocess.run(
+            [sys.executable, "-c", COLD], capture_output=True, text=True, check=True
+        ).stdout.split()
+        for _ in range(runs)
+    ]
     parts = np.median(np.array(rows, float), axis=0)
-    return dict(zip(("import_s", "build_s", "solve_s", "total_s"), [*map(float, parts), float(parts.sum())], strict=True))
+    return dict(
+        zip(
+            ("import_s", "build_s", "solve_s", "total_s"),
+            [*map(float, parts), float(parts.sum())],
+            strict=True,
+        )
+    )
 
 
 def cell(entry: dict[str, float], per: int = 1) -> str:
@@ -88,7 +109,9 @@ def cell(entry: dict[str, float], per: int = 1) -> str:
 
 def main() -> None:
     """Run the benchmark and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--json", type=Path, help="write the figures here too")
     parser.add_argument("--cold", action="store_true", help="measure the cold start as well")
     options = parser.parse_args()
@@ -98,19 +121,35 @@ def main() -> None:
     }
     if options.cold:
         report["cold"] = cold_start()
-        print("first answer from a cold process:", ", ".join(f"{k} {v:.2f}" for k, v in report["cold"].items()))
+        print(
+            "first answer from a cold process:",
+            ", ".join(f"{k} {v:.2f}" for k, v in report["cold"].items()),
+        )
     jax.config.update("jax_enable_x64", True)
-    jobs = [("A3, three threads", "A3", vsr.StrainDependent(32, 4)), ("B1, one helix", "B1", vsr.StrainDependent(16, 6))]
+    jobs = [
+        ("A3, three threads", "A3", vsr.StrainDependent(32, 4)),
+        ("B1, one helix", "B1", vsr.StrainDependent(16, 6)),
+    ]
     print(f"{report['machine']}, jax {report['jax']}; us a shape: median (10 %-90 %), compile time")
-    print("| scene | nodes | dtype | single | strains, 1,024 | tips, 1,024 | gradient, 1,024 | gradient / tips |")
+    print(
+        "| scene | nodes | dtype | single | strains, 1,024 | tips, 1,024 | gradient, 1,024 | "
+        "gradient / tips |"
+    )
     print("|" + "---|" * 8)
     report["rows"] = []
     for name, case, model in jobs:
         for dtype in ("float64", "float32"):
             row = measure(name, paper.scene(case), model, dtype)
             report["rows"].append(row)
-            cells = [cell(row["single"]), *(cell(row[k], BATCH) for k in ("strains only", "batch", "gradient"))]
-            print(f"| {name} | {row['nodes']} | {dtype} | {' | '.join(cells)} | {row['gradient_over_batch']:.2f} |", flush=True)
+            cells = [
+                cell(row["single"]),
+                *(cell(row[k], BATCH) for k in ("strains only", "batch", "gradient")),
+            ]
+            print(
+                f"| {name} | {row['nodes']} | {dtype} | {' | '.join(cells)} | "
+                f"{row['gradient_over_batch']:.2f} |",
+                flush=True,
+            )
     if options.json:
         options.json.parent.mkdir(parents=True, exist_ok=True)
         options.json.write_text(json.dumps(report, indent=1) + "\n")

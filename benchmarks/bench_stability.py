@@ -1,10 +1,12 @@
-"""Time of the stability margin of a loaded catheter beside that of its solve, and of the dense eigenvalue problem it replaced.
+"""Time of the stability margin of a loaded catheter beside that of its solve, and of the dense
+eigenvalue problem it replaced.
 
     python benchmarks/bench_stability.py [--json FILE] [--rounds N]
 
-Two sections, eight tendons, gravity and a force on the tip, all in turn in one run. "dense" differentiates the residual by every strain
-and computes all eigenvalues by LAPACK, without nodes on pieces without length, where it has 0 / 0. "gradient" is that of the margin
-by the tensions, through the solve.
+Two sections, eight tendons, gravity and a force on the tip, all in turn in one run. "dense"
+differentiates the residual by every strain and computes all eigenvalues by LAPACK, without nodes on
+pieces without length, where it has 0 / 0. "gradient" is that of the margin by the tensions, through
+the solve.
 """
 
 import argparse
@@ -18,25 +20,32 @@ import jax.numpy as jnp
 import numpy as np
 
 import vsr_jax as vsr
-from vsr_jax.balance import residual
-from vsr_jax.equilibrium import Equilibrium
-from vsr_jax.reaction import loading, react
-from vsr_jax.stability import extreme
-from vsr_jax.timing import Timed, machine, take_turns
+from vsr_jax.mechanics.balance import residual
+from vsr_jax.mechanics.reaction import loading, react
+from vsr_jax.solution.equilibrium import Equilibrium
+from vsr_jax.solution.stability import extreme
+from vsr_jax.studies.timing import Timed, machine, take_turns
 
 TENSIONS = [3.0, 1.0, 0.0, 0.5, 2.0, 0.0, 1.0, 0.5]
 
 
 def catheter() -> vsr.Scene:
-    """Nitinol wire of 0.4 m with discs of 10 mm radius, four tendons to its middle and four to its tip."""
-    rod = vsr.Rod(0.4, vsr.Circular(0.0007), vsr.Material(54e9, poisson=0.3, density=6450), guide_radius=0.0101)
+    """Nitinol wire of 0.4 m with discs of 10 mm radius, four tendons to its middle and four to its
+    tip."""
+    rod = vsr.Rod(
+        0.4,
+        vsr.Circular(0.0007),
+        vsr.Material(54e9, poisson=0.3, density=6450),
+        guide_radius=0.0101,
+    )
     places = [(0.01, 0.0), (0.0, 0.01), (-0.01, 0.0), (0.0, -0.01)]
     tendons = [vsr.Tendon(vsr.Parallel(y, z), end=end) for end in (0.2, None) for y, z in places]
     return vsr.Scene(rod, tendons, [vsr.Gravity(), vsr.TipWrench(force=(0.0, 0.0, 0.1))])
 
 
 def dense(eq: Equilibrium, there: np.ndarray) -> jax.Array:
-    """All eigenvalues of the symmetric part of the scaled tangent, as before Lanczos' method; `there`: places of unknowns with weight."""
+    """All eigenvalues of the symmetric part of the scaled tangent, as before Lanczos' method;
+    `there`: places of unknowns with weight."""
     nodes, tau = eq._nodes(), eq._nodes().tau(eq._sound_forces)
     grid, loads = nodes.grid, loading(eq.scene, nodes.grid)
     assert loads is not None
@@ -44,11 +53,15 @@ def dense(eq: Equilibrium, there: np.ndarray) -> jax.Array:
 
     def imbalance(values: jax.Array) -> jax.Array:
         xi = tuple(values.reshape(still.shape))
-        return jnp.stack(residual(xi, nodes.sections, tau, react(xi, grid, loads).wrench)).reshape(-1)
+        return jnp.stack(residual(xi, nodes.sections, tau, react(xi, grid, loads).wrench)).reshape(
+            -1
+        )
 
     jacobian = jax.jacfwd(imbalance)(still.reshape(-1))
     weight = jnp.broadcast_to(grid.weight, still.shape).reshape(-1)
-    stiffness = jnp.stack([jnp.broadcast_to(s, grid.X.shape) for s in nodes.sections.stiffness]).reshape(-1)
+    stiffness = jnp.stack(
+        [jnp.broadcast_to(s, grid.X.shape) for s in nodes.sections.stiffness]
+    ).reshape(-1)
     root = jnp.sqrt(weight * stiffness)[there]
     scaled = (weight[:, None] * jacobian)[there][:, there] / (root[:, None] * root[None, :])
     return jnp.linalg.eigvalsh(0.5 * (scaled + scaled.T))[jnp.array([0, -1])]
@@ -56,14 +69,22 @@ def dense(eq: Equilibrium, there: np.ndarray) -> jax.Array:
 
 def count(jaxpr: Any) -> int:
     """Equations of a program, those of the programs inside it included."""
-    inner = [value for eqn in jaxpr.eqns for value in jax.tree.leaves(list(eqn.params.values()), is_leaf=lambda x: hasattr(x, "eqns"))]
+    inner = [
+        value
+        for eqn in jaxpr.eqns
+        for value in jax.tree.leaves(
+            list(eqn.params.values()), is_leaf=lambda x: hasattr(x, "eqns")
+        )
+    ]
     inner = [getattr(value, "jaxpr", value) for value in inner]
     return len(jaxpr.eqns) + sum(count(value) for value in inner if hasattr(value, "eqns"))
 
 
 def main() -> None:
     """Run the benchmark and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--json", type=Path, help="write the figures here too")
     parser.add_argument("--rounds", type=int, default=15)
     options = parser.parse_args()
@@ -87,21 +108,44 @@ def main() -> None:
         "dense": (lambda eq: dense(eq, there), (eq,), 1),
         "gradient": (slope, (scene, inputs), 3),
     }
-    jobs = {name: Timed(function, *args, calls=calls) for name, (function, args, calls) in programs.items()}
+    jobs = {
+        name: Timed(function, *args, calls=calls)
+        for name, (function, args, calls) in programs.items()
+    }
     take_turns(jobs.values(), options.rounds)
-    equations = {name: count(jax.make_jaxpr(function)(*args).jaxpr) for name, (function, args, _) in programs.items()}
+    equations = {
+        name: count(jax.make_jaxpr(function)(*args).jaxpr)
+        for name, (function, args, _) in programs.items()
+    }
     rows = {name: job.summary() | {"equations": equations[name]} for name, job in jobs.items()}
-    difference = float(np.max(np.abs(np.array(jobs["margin"].output) - np.asarray(jobs["dense"].output)[0])))
-    report = {"machine": machine(), "jax": jax.__version__, "tensions": TENSIONS, "margin": float(eq.stability), "rows": rows}
+    difference = float(
+        np.max(np.abs(np.array(jobs["margin"].output) - np.asarray(jobs["dense"].output)[0]))
+    )
+    report = {
+        "machine": machine(),
+        "jax": jax.__version__,
+        "tensions": TENSIONS,
+        "margin": float(eq.stability),
+        "rows": rows,
+    }
     report |= {"difference from dense": difference}
     for name in ("margin", "dense", "gradient"):
         report[f"{name} / solve"] = rows[name]["median_us"] / rows["solve"]["median_us"]
-    print(f"{report['machine']}, jax {report['jax']}; margin {report['margin']:.6f}, off the dense one by {difference:.1e}")
-    print("| program | ms, median (10 %-90 %) | of a solve | compile [s] | equations |\n|" + "---|" * 5)
+    print(
+        f"{report['machine']}, jax {report['jax']}; margin {report['margin']:.6f}, off the dense "
+        f"one by {difference:.1e}"
+    )
+    print(
+        "| program | ms, median (10 %-90 %) | of a solve | compile [s] | equations |\n|"
+        + "---|" * 5
+    )
     for name, row in rows.items():
         low, mid, high = (1e-3 * row[key] for key in ("low_us", "median_us", "high_us"))
         share = row["median_us"] / rows["solve"]["median_us"]
-        print(f"| {name} | {mid:.2f} ({low:.2f}-{high:.2f}) | {share:.2f} | {row['compile_s']:.1f} | {row['equations']} |")
+        print(
+            f"| {name} | {mid:.2f} ({low:.2f}-{high:.2f}) | {share:.2f} | {row['compile_s']:.1f} "
+            f"| {row['equations']} |"
+        )
     if options.json:
         options.json.parent.mkdir(parents=True, exist_ok=True)
         options.json.write_text(json.dumps(report, indent=1) + "\n")

@@ -1,13 +1,16 @@
-"""How fast and how large sweeps are: samples, nodes, threads, sections, loads, devices; the machine's limit; a million shapes, killed.
+"""How fast and how large sweeps are: samples, nodes, threads, sections, loads, devices; the
+machine's limit; a million shapes, killed.
 
-    pip install ".[sweep]" && python benchmarks/bench_sweep.py [--json FILE] [--plot FILE] [--million]
+    pip install ".[sweep]" && python benchmarks/bench_sweep.py
+        [--json FILE] [--plot FILE] [--million]
 
-The arm is the paper's B1, a helical thread, at 16 steps of order 6, with tensions from [0, 15] N, unless a row says otherwise. All
-rates are those of `vsr.sweep`, copies to and from the devices included, compiled before; medians of several runs in turn, with
-the fastest and the slowest. Each core of the CPU is a device, as `vsr-jax sweep` has it, unless a row says otherwise.
+The arm is the paper's B1, a helical thread, at 16 steps of order 6, with tensions from [0, 15] N,
+unless a row says otherwise. All rates are those of `vsr.sweep`, copies to and from the devices
+included, compiled before; medians of several runs in turn, with the fastest and the slowest. Each
+core of the CPU is a device, as `vsr-jax sweep` has it, unless a row says otherwise.
 
-`--million` sweeps a million shapes to disk in a process of its own, kills that at a random moment, lets another go on, and
-compares what is on disk with a sweep that nobody killed.
+`--million` sweeps a million shapes to disk in a process of its own, kills that at a random moment,
+lets another go on, and compares what is on disk with a sweep that nobody killed.
 """
 
 import argparse
@@ -29,9 +32,9 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from matplotlib.figure import Figure
 
 import vsr_jax as vsr
-from vsr_jax.balance import newton_step
-from vsr_jax.cli_common import one_device_a_core
-from vsr_jax.timing import Timed, machine, take_turns
+from vsr_jax.cli.common import one_device_a_core
+from vsr_jax.mechanics.balance import newton_step
+from vsr_jax.studies.timing import Timed, machine, take_turns
 
 one_device_a_core()
 
@@ -46,7 +49,8 @@ import jax; jax.config.update("jax_enable_x64", True)
 import bench_sweep as b
 path, samples = sys.argv[1], int(sys.argv[2])
 import vsr_jax as vsr
-result = vsr.sweep(b.helix(), b.tensions(samples), model=vsr.StrainDependent(b.STEPS), out=path, progress=False)
+model = vsr.StrainDependent(b.STEPS)
+result = vsr.sweep(b.helix(), b.tensions(samples), model=model, out=path, progress=False)
 print(1024 * int(re.search(r"VmHWM:\\s*(\\d+)", Path("/proc/self/status").read_text())[1]))
 """
 
@@ -61,7 +65,9 @@ def rod(sections: int = 1) -> vsr.Rod:
 
 def helix(threads: int = 1, sections: int = 1, loads: tuple = ()) -> vsr.Scene:
     """An arm with helical tendons."""
-    laid = [vsr.Tendon(vsr.Helix(0.005, 1.529, phase=2 * np.pi * i / threads)) for i in range(threads)]
+    laid = [
+        vsr.Tendon(vsr.Helix(0.005, 1.529, phase=2 * np.pi * i / threads)) for i in range(threads)
+    ]
     return vsr.Scene(rod(sections), laid, list(loads)).astype("float64")
 
 
@@ -75,11 +81,20 @@ def place(eq: vsr.Equilibrium) -> dict[str, Any]:
     return {"tip": eq.tip[:3, 3]}
 
 
-def job(scene: vsr.Scene, inputs: np.ndarray, steps: int = STEPS, devices: Any = None) -> Callable[[], Any]:
+def job(
+    scene: vsr.Scene, inputs: np.ndarray, steps: int = STEPS, devices: Any = None
+) -> Callable[[], Any]:
     """A sweep ready to run, compiled."""
 
     def run() -> Any:
-        return vsr.sweep(scene, inputs, outputs=place, model=vsr.StrainDependent(steps), devices=devices, progress=False)
+        return vsr.sweep(
+            scene,
+            inputs,
+            outputs=place,
+            model=vsr.StrainDependent(steps),
+            devices=devices,
+            progress=False,
+        )
 
     run()
     return run
@@ -95,9 +110,19 @@ def rates(jobs: dict[str, tuple[Callable, int]], rounds: int = ROUNDS) -> list[d
             seconds[name].append(time.perf_counter() - start)
     rows = []
     for name, (_, samples) in jobs.items():
-        low, median, high = (samples / x for x in (max(seconds[name]), np.median(seconds[name]), min(seconds[name])))
+        low, median, high = (
+            samples / x for x in (max(seconds[name]), np.median(seconds[name]), min(seconds[name]))
+        )
         print(f"{name:34s} {median:>10,.0f} shapes/s ({low:,.0f}-{high:,.0f})", flush=True)
-        rows.append({"name": name, "samples": samples, "per_s": float(median), "low": float(low), "high": float(high)})
+        rows.append(
+            {
+                "name": name,
+                "samples": samples,
+                "per_s": float(median),
+                "low": float(low),
+                "high": float(high),
+            }
+        )
     return rows
 
 
@@ -105,18 +130,33 @@ def studies() -> dict[str, list[dict[str, Any]]]:
     """Rates by what is varied."""
     gravity, many = (vsr.Gravity(),), tensions(SAMPLES)
     few = 2048
-    by = {"samples": {f"{n:,} samples": (job(helix(), tensions(n)), n) for n in (1, 10, 100, 1_000, 10_000, 100_000, MILLION)}}
-    by["nodes"] = {f"{3 * n} nodes": (job(helix(), many, n), SAMPLES) for n in (2, 4, 8, 16, 32, 64)}
-    by["threads"] = {f"{n} threads": (job(helix(n), tensions(SAMPLES, n)), SAMPLES) for n in (1, 2, 3, 4, 6)}
+    by = {
+        "samples": {
+            f"{n:,} samples": (job(helix(), tensions(n)), n)
+            for n in (1, 10, 100, 1_000, 10_000, 100_000, MILLION)
+        }
+    }
+    by["nodes"] = {
+        f"{3 * n} nodes": (job(helix(), many, n), SAMPLES) for n in (2, 4, 8, 16, 32, 64)
+    }
+    by["threads"] = {
+        f"{n} threads": (job(helix(n), tensions(SAMPLES, n)), SAMPLES) for n in (1, 2, 3, 4, 6)
+    }
     by["sections"] = {f"{n} sections": (job(helix(1, n), many), SAMPLES) for n in (1, 2, 4, 8)}
     by["precision and loads"] = {
         "float64": (job(helix(), many), SAMPLES),
         "float32": (job(helix().astype("float32"), tensions(SAMPLES, dtype="float32")), SAMPLES),
         "gravity, float64": (job(helix(loads=gravity), tensions(few)), few),
-        "gravity, float32": (job(helix(loads=gravity).astype("float32"), tensions(few, dtype="float32")), few),
+        "gravity, float32": (
+            job(helix(loads=gravity).astype("float32"), tensions(few, dtype="float32")),
+            few,
+        ),
     }
     devices = jax.local_devices()
-    by["devices"] = {f"{n} devices": (job(helix(), many, devices=devices[:n]), SAMPLES) for n in range(1, len(devices) + 1)}
+    by["devices"] = {
+        f"{n} devices": (job(helix(), many, devices=devices[:n]), SAMPLES)
+        for n in range(1, len(devices) + 1)
+    }
     found = {}
     for name, jobs in by.items():
         print(f"\nby {name}")
@@ -124,14 +164,15 @@ def studies() -> dict[str, list[dict[str, Any]]]:
     return found
 
 
-def limit(lanes: int = 512) -> dict[str, float]:
+def limit(batch_size: int = 512) -> dict[str, float]:
     """Floating-point operations: of the machine in a second, at most, and of a shape.
 
-    The operations of a shape are those of one Newton step at all nodes times the steps taken, and those of all the rest, as XLA
-    counts them: a division, a root and a sine count as one each, which a processor takes ten times as long for.
+    The operations of a shape are those of one Newton step at all nodes times the steps taken, and
+    those of all the rest, as XLA counts them: a division, a root and a sine count as one each,
+    which a processor takes ten times as long for.
     """
     machine_rate = _most_operations()
-    scene, model, inputs = helix(), vsr.StrainDependent(STEPS), jnp.asarray(tensions(lanes))
+    scene, model, inputs = helix(), vsr.StrainDependent(STEPS), jnp.asarray(tensions(batch_size))
 
     def whole(inputs: jax.Array) -> Any:
         return jax.vmap(lambda u: vsr.solve(scene, u, model=model).tip[:3, 3])(inputs)
@@ -139,18 +180,23 @@ def limit(lanes: int = 512) -> dict[str, float]:
     def step(inputs: jax.Array) -> Any:
         def one(u: jax.Array) -> Any:
             sections = scene.sections(model.grid(scene).X)
-            return newton_step(sections.rest, sections, sections.carry(scene.forces(u)), None, scene.free)
+            return newton_step(
+                sections.rest, sections, sections.carry(scene.forces(u)), None, scene.free
+            )
 
         return jax.vmap(one)(inputs)
 
-    counted = [(Timed(f, inputs).operations or 0) / lanes for f in (whole, step)]
+    counted = [(Timed(f, inputs).operations or 0) / batch_size for f in (whole, step)]
     taken = float(jnp.mean(jax.vmap(lambda u: vsr.solve(scene, u, model=model).steps)(inputs)))
     operations = counted[0] + (taken - 1) * counted[1]
     return {"machine_flops": machine_rate, "newton_steps": taken, "operations_a_shape": operations}
 
 
-def _most_operations(chains: int = 4, depth: int = 32, size: int = 65_536, times: int = 200) -> float:
-    """Operations a second of chains of fused multiply-adds that stay in the registers, on all devices at once."""
+def _most_operations(
+    chains: int = 4, depth: int = 32, size: int = 65_536, times: int = 200
+) -> float:
+    """Operations a second of chains of fused multiply-adds that stay in the registers, on all
+    devices at once."""
 
     def body(_: int, x: jax.Array) -> jax.Array:
         y = [x * (1 + 1e-3 * i) for i in range(chains)]
@@ -162,7 +208,15 @@ def _most_operations(chains: int = 4, depth: int = 32, size: int = 65_536, times
         return jax.lax.fori_loop(0, times, body, x)
 
     mesh = Mesh(np.array(jax.local_devices()), ("parts",))
-    spread = jax.jit(jax.shard_map(chain, mesh=mesh, in_specs=PartitionSpec("parts"), out_specs=PartitionSpec("parts"), check_vma=False))
+    spread = jax.jit(
+        jax.shard_map(
+            chain,
+            mesh=mesh,
+            in_specs=PartitionSpec("parts"),
+            out_specs=PartitionSpec("parts"),
+            check_vma=False,
+        )
+    )
     x = jnp.linspace(0.9, 1.0, size * mesh.devices.size)
     job = Timed(spread, jax.device_put(x, NamedSharding(mesh, PartitionSpec("parts"))))
     take_turns([job], 9)
@@ -171,7 +225,10 @@ def _most_operations(chains: int = 4, depth: int = 32, size: int = 65_536, times
 
 def million(samples: int = MILLION) -> dict[str, Any]:
     """A sweep to disk that is killed and goes on, against one that is not."""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path]),
+    }
 
     def start(path: Path) -> subprocess.Popen:
         arguments = [sys.executable, "-c", CHILD, str(path), str(samples)]
@@ -196,12 +253,26 @@ def million(samples: int = MILLION) -> dict[str, Any]:
         done = int(np.count_nonzero(np.asarray(zarr.open_group(killed, mode="r")["status"]) >= 0))
         rest, _ = finish(killed)
         groups = [zarr.open_group(path, mode="r") for path in (whole, killed)]
-        same = all(np.asarray(groups[0][name]).tobytes() == np.asarray(groups[1][name]).tobytes() for name in ("tip", "status"))
-    row = {"samples": samples, "seconds": seconds, "memory_bytes": memory, "done_when_killed": done, "rest_s": rest, "identical": same}
+        same = all(
+            np.asarray(groups[0][name]).tobytes() == np.asarray(groups[1][name]).tobytes()
+            for name in ("tip", "status")
+        )
+    row = {
+        "samples": samples,
+        "seconds": seconds,
+        "memory_bytes": memory,
+        "done_when_killed": done,
+        "rest_s": rest,
+        "identical": same,
+    }
     print(
-        f"\n{samples:,} shapes to disk: {seconds:.1f} s with start and compiling, {memory / 2**30:.2f} GiB at most; killed after {done:,}"
+        f"\n{samples:,} shapes to disk: {seconds:.1f} s with start and compiling, "
+        f"{memory / 2**30:.2f} GiB at most; killed after {done:,}"
     )
-    print(f"the rest took {rest:.1f} s; what is on disk is {'the same to the bit' if same else 'NOT the same'}")
+    print(
+        f"the rest took {rest:.1f} s; what is on disk is "
+        f"{'the same to the bit' if same else 'NOT the same'}"
+    )
     return row
 
 
@@ -213,7 +284,14 @@ def draw(found: dict[str, list[dict[str, Any]]], path: str) -> None:
         rate = np.array([[row[key] for key in ("per_s", "low", "high")] for row in rows]).T
         spread = np.abs(rate[1:] - rate[0])
         if name in ("samples", "nodes"):
-            ax.errorbar([float(text.replace(",", "")) for text in names], rate[0], spread, marker="o", capsize=3, color="#0072B2")
+            ax.errorbar(
+                [float(text.replace(",", "")) for text in names],
+                rate[0],
+                spread,
+                marker="o",
+                capsize=3,
+                color="#0072B2",
+            )
             ax.set(xscale="log", yscale="log")
         else:
             ax.bar(names, rate[0], yerr=spread, color="#0072B2", capsize=3)
@@ -225,20 +303,32 @@ def draw(found: dict[str, list[dict[str, Any]]], path: str) -> None:
 
 def main() -> None:
     """All studies, the table, and what is asked for besides."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--json", type=Path, help="write the figures here too")
     parser.add_argument("--plot", metavar="FILE", help="draw them")
-    parser.add_argument("--million", action="store_true", help="a million shapes to disk, killed once")
+    parser.add_argument(
+        "--million", action="store_true", help="a million shapes to disk, killed once"
+    )
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    report: dict[str, Any] = {"machine": machine(), "jax": jax.__version__, "devices": jax.local_device_count()}
+    report: dict[str, Any] = {
+        "machine": machine(),
+        "jax": jax.__version__,
+        "devices": jax.local_device_count(),
+    }
     print(f"{report['machine']}, jax {report['jax']}, {report['devices']} devices")
     report["limit"] = limit()
     report["rates"] = studies()
     fastest = max(row["per_s"] for row in report["rates"]["samples"])
     share = fastest * report["limit"]["operations_a_shape"] / report["limit"]["machine_flops"]
     report["limit"]["share"] = share
-    print("\n{operations_a_shape:,.0f} operations a shape, {machine_flops:.2e} a second at most".format(**report["limit"]), end="")
+    print(
+        "\n{operations_a_shape:,.0f} operations per shape, "
+        "{machine_flops:.2e} per second at most".format(**report["limit"]),
+        end="",
+    )
     print(f": the fastest sweep does {share:.0%} of that")
     if options.million:
         report["million"] = million()

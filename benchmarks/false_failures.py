@@ -1,14 +1,18 @@
-"""A search for equilibria that are refused: ordinary scenes are drawn and solved, and an independent path looks for what was not found.
+"""A search for equilibria that are refused: ordinary scenes are drawn and solved, and an
+independent path looks for what was not found.
 
-For each draw that does not converge, load steps in NumPy (see `load_steps`), which share nothing with the package, follow the
-equilibrium from no load. Where they reach the end by stable equilibria, on two meshes, with the arm bent by a turn at most, the
-refusal is a false failure: it is printed and kept with all its numbers. Where stability is lost on the way the arm snaps, which
-counts apart. Of each draw that converges the same code starts from the shape that was returned and has to stay there, and with
-`--gradients` the derivative of the tip by the share of all loads and inputs has to be finite. Run it with
+For each draw that does not converge, load steps in NumPy (see `load_steps`), which share nothing
+with the package, follow the equilibrium from no load. Where they reach the end by stable
+equilibria, on two meshes, with the arm bent by a turn at most, the refusal is a false failure: it
+is printed and kept with all its numbers. Where stability is lost on the way the arm snaps, which
+counts apart. Of each draw that converges the same code starts from the shape that was returned and
+has to stay there, and with `--gradients` the derivative of the tip by the share of all loads and
+inputs has to be finite. Run it with
 
     python benchmarks/false_failures.py --json benchmarks/results/false_failures.json
 
-`ordinary_scenes.built(STRUCTURES[case["structure"]], case["numbers"])` builds a case of that file again.
+`ordinary_scenes.built(STRUCTURES[case["structure"]], case["numbers"])` builds a case of that file
+again.
 """
 
 import argparse
@@ -22,14 +26,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # the systems are small
-os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0")  # nothing is timed
+os.environ.setdefault(
+    "XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
+)  # nothing is timed
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import vsr_jax as vsr
-from vsr_jax.resolution import COARSE
+from vsr_jax.mechanics.resolution import COARSE
 
 try:
     from benchmarks import load_steps
@@ -42,7 +48,8 @@ STEPS = 16
 A_TURN = 2 * math.pi
 """How far an ordinary arm is bent at most [rad]."""
 SAME = 0.02
-"""Largest distance of the tips of one equilibrium on two meshes, as a share of the length; `COARSE` is what a status promises."""
+"""Largest distance of the tips of one equilibrium on two meshes, as a share of the length; `COARSE`
+is what a status promises."""
 
 
 class Answer(NamedTuple):
@@ -68,10 +75,15 @@ def answers(structure: Structure, draws: dict[str, jax.Array]) -> Answer:
 
 @partial(jax.jit, static_argnums=0)
 def slopes(structure: Structure, draws: dict[str, jax.Array]) -> jax.Array:
-    """Derivatives in reverse mode of a sum over the tip by the share of loads and inputs, which calls for all adjoints of a solve."""
+    """Derivatives in reverse mode of a sum over the tip by the share of loads and inputs, which
+    calls for all adjoints of a solve."""
 
     def tip(share: jax.Array, numbers: Numbers) -> jax.Array:
-        return jnp.sum(vsr.solve(*built(structure, numbers, share), model=vsr.StrainDependent(STEPS)).tip[:3, 3])
+        return jnp.sum(
+            vsr.solve(*built(structure, numbers, share), model=vsr.StrainDependent(STEPS)).tip[
+                :3, 3
+            ]
+        )
 
     return jax.vmap(jax.grad(tip), (None, 0))(jnp.ones(()), draws)
 
@@ -86,7 +98,12 @@ def sought(structure: Structure, numbers: Numbers) -> tuple[str, dict[str, Any]]
     arm = load_steps.Arm(structure, numbers)
     path = arm.follow()
     turn, tip = arm.turn(path.strain), arm.tip(path.strain)
-    record = {"turn": turn, "share": path.share, "margin": path.margin.all, "least margin": path.least}
+    record = {
+        "turn": turn,
+        "share": path.share,
+        "margin": path.margin.all,
+        "least margin": path.least,
+    }
     record["tip"] = (numbers["length"] * tip).tolist()
     if turn > A_TURN:
         return "beyond a turn", record
@@ -96,12 +113,15 @@ def sought(structure: Structure, numbers: Numbers) -> tuple[str, dict[str, Any]]
         return "flutters", record
     fine = load_steps.Arm(structure, numbers, 2 * load_steps.ELEMENTS)
     found = fine.balance(np.repeat(path.strain, 2, axis=0), path.tension, 1.0)
-    sure = found is not None and found[2].all > 0 and np.linalg.norm(fine.tip(found[0]) - tip) < SAME
+    sure = (
+        found is not None and found[2].all > 0 and np.linalg.norm(fine.tip(found[0]) - tip) < SAME
+    )
     return ("false failure" if sure else "in doubt"), record
 
 
 def confirmed(structure: Structure, numbers: Numbers, answer: Answer) -> tuple[str, dict[str, Any]]:
-    """Whether a converged shape is what the independent code stays at, on a finer mesh where need be, and how far the arm is bent."""
+    """Whether a converged shape is what the independent code stays at, on a finer mesh where need
+    be, and how far the arm is bent."""
     L, record = numbers["length"], {}
     unit = numbers["young"] * np.pi * numbers["radius"] ** 4 / 4 / L**2
     for finer in (1, 4):
@@ -112,13 +132,22 @@ def confirmed(structure: Structure, numbers: Numbers, answer: Answer) -> tuple[s
         if found is None or np.linalg.norm(arm.tip(found[0]) - answer.tip / L) > COARSE:
             continue
         record["margin"] = found[2].all
-        said = "converged" if found[2].all > 0 else "converged, flutters" if found[2].real > 0 else "wrong: not stable"
-        return (f"{said}, beyond a turn" if said == "converged" and record["turn"] > A_TURN else said), record
+        said = (
+            "converged"
+            if found[2].all > 0
+            else "converged, flutters"
+            if found[2].real > 0
+            else "wrong: not stable"
+        )
+        return (
+            f"{said}, beyond a turn" if said == "converged" and record["turn"] > A_TURN else said
+        ), record
     return "wrong: another shape", record
 
 
 def search(name: str, count: int, seed: int, gradients: bool = False) -> dict[str, Any]:
-    """Verdicts on the draws of a structure, and the draws that are false failures, in doubt or wrong."""
+    """Verdicts on the draws of a structure, and the draws that are false failures, in doubt or
+    wrong."""
     structure, begin = STRUCTURES[name], time.perf_counter()
     draws = drawn(structure, count, seed)
     stacked = {key: jnp.asarray(np.array([draw[key] for draw in draws])) for key in draws[0]}
@@ -138,8 +167,20 @@ def search(name: str, count: int, seed: int, gradients: bool = False) -> dict[st
             said, where = sought(structure, numbers)
             verdicts[f"{status}: {said}"] += 1
         if said.startswith(("false", "wrong", "in doubt")):
-            cases.append({"name": f"{name} {i}", "verdict": said, "status": status, **where, "structure": name, "numbers": numbers})
-    false, there = (sum(verdicts[v] for v in verdicts if v.endswith(end)) for end in ("false failure", "converged"))
+            cases.append(
+                {
+                    "name": f"{name} {i}",
+                    "verdict": said,
+                    "status": status,
+                    **where,
+                    "structure": name,
+                    "numbers": numbers,
+                }
+            )
+    false, there = (
+        sum(verdicts[v] for v in verdicts if v.endswith(end))
+        for end in ("false failure", "converged")
+    )
     return {
         "draws": count,
         "statuses": dict(statuses.most_common()),
@@ -156,19 +197,39 @@ def told(name: str, record: dict[str, Any]) -> None:
     """Prints what came out."""
     verdicts = ", ".join(f"{count} {said}" for said, count in record["verdicts"].items())
     there = record["have a stable equilibrium"]
-    print(f"{name}: {record['false failures']} of {there} refused ({100 * record['rate']:.1f} %); {verdicts}", flush=True)
+    print(
+        f"{name}: {record['false failures']} of {there} refused ({100 * record['rate']:.1f} %); "
+        f"{verdicts}",
+        flush=True,
+    )
     for case in record["cases"]:
-        print(f"  {case['name']}: {case['status']}, {case['verdict']}, bent by {case['turn']:.2f} rad")
+        print(
+            f"  {case['name']}: {case['status']}, {case['verdict']}, bent by {case['turn']:.2f} rad"
+        )
 
 
 def main() -> None:
     """Searches all structures, or some."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--draws", type=int, default=200, help="of each structure (default: %(default)s)")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--draws", type=int, default=200, help="of each structure (default: %(default)s)"
+    )
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--structures", nargs="*", default=list(STRUCTURES), choices=list(STRUCTURES), metavar="NAME")
+    parser.add_argument(
+        "--structures",
+        nargs="*",
+        default=list(STRUCTURES),
+        choices=list(STRUCTURES),
+        metavar="NAME",
+    )
     parser.add_argument("--json", metavar="FILE", type=Path)
-    parser.add_argument("--gradients", action="store_true", help="check them too, which takes three times as long to compile")
+    parser.add_argument(
+        "--gradients",
+        action="store_true",
+        help="check them too, which takes three times as long to compile",
+    )
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     record = {}
@@ -177,7 +238,10 @@ def main() -> None:
         told(name, record[name])
         if options.json:
             options.json.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
-    false, there = (sum(r[key] for r in record.values()) for key in ("false failures", "have a stable equilibrium"))
+    false, there = (
+        sum(r[key] for r in record.values())
+        for key in ("false failures", "have a stable equilibrium")
+    )
     print(f"all: {false} of {there} refused ({100 * false / max(there, 1):.2f} %)")
 
 

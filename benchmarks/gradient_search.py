@@ -1,15 +1,19 @@
-r"""A search for gradients that are finite and wrong: forward mode, reverse mode and differences of the solve, on drawn scenes.
+r"""A search for gradients that are finite and wrong: forward mode, reverse mode and differences of
+the solve, on drawn scenes.
 
     python benchmarks/gradient_search.py --json benchmarks/results/gradients.json
 
-A structure is a subset of the effects below and where they act. Twelve are chosen so that any two effects occur together, one
-without the other, and neither, and of each seventeen scenes are drawn, whose numbers (sizes, moduli, base, rest strain, routings,
-loads, friction, inputs) are all random. A function f of the tip's pose, the forces found and the slack is differentiated by all
-numbers of scene and inputs at once, along a random direction v: in forward mode, in reverse mode (the gradient times v), and by
-fourth-order central differences of the solve. The three have to agree to 1e-7 of the derivative. NaN is no derivative, and counted
-apart; so are scenes without an equilibrium, whose derivatives have to be zero or NaN in both modes. A difference knows its own error
-from those of other step sizes. It counts only where the solve is smooth: points at which another cable is slack than at the centre,
-or steps are shared otherwise by the pieces of the arm, are left out, and a scene with too few points left is counted as at a switch.
+A structure is a subset of the effects below and where they act. Twelve are chosen so that any two
+effects occur together, one without the other, and neither, and of each seventeen scenes are drawn,
+whose numbers (sizes, moduli, base, rest strain, routings, loads, friction, inputs) are all random.
+A function f of the tip's pose, the forces found and the slack is differentiated by all numbers of
+scene and inputs at once, along a random direction v: in forward mode, in reverse mode (the gradient
+times v), and by fourth-order central differences of the solve. The three have to agree to 1e-7 of
+the derivative. NaN is no derivative, and counted apart; so are scenes without an equilibrium, whose
+derivatives have to be zero or NaN in both modes. A difference knows its own error from those of
+other step sizes. It counts only where the solve is smooth: points at which another cable is slack
+than at the centre, or steps are shared otherwise by the pieces of the arm, are left out, and a
+scene with too few points left is counted as at a switch.
 """
 
 import argparse
@@ -21,7 +25,9 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
 
-os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0")  # nothing is timed
+os.environ.setdefault(
+    "XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
+)  # nothing is timed
 
 import jax
 import jax.numpy as jnp
@@ -33,15 +39,33 @@ import vsr_jax as vsr
 SEED = 12
 STEPS = 8
 SAME = 1e-7
-"""Largest difference between two derivatives that count as the same, as a share of the derivative."""
+"""Largest difference between two derivatives that count as the same, as a share of the
+derivative."""
 WIDEST, HALVINGS = 0.02, 10
 """Largest step of the differences as a share of each number, and how often it is halved."""
 
-EFFECTS = ("gravity", "fluid", "dead", "follower", "pull", "release", "length", "elastic", "chamber", "jumps", "free strains")
-"""Gravity, in a fluid; wrenches in space; wrenches that follow; friction of tendons that are pulled, released; tendons driven by their
-length, elastic ones; a chamber; sections and threads that end, wrenches on the way; only some of the strains free."""
+EFFECTS = (
+    "gravity",
+    "fluid",
+    "dead",
+    "follower",
+    "pull",
+    "release",
+    "length",
+    "elastic",
+    "chamber",
+    "jumps",
+    "free strains",
+)
+"""Gravity, in a fluid; wrenches in space; wrenches that follow; friction of tendons that are
+pulled, released; tendons driven by their length, elastic ones; a chamber; sections and threads that
+end, wrenches on the way; only some of the strains free."""
 NEEDS = {"fluid": "gravity", "elastic": "length"}
-FREE = (("bending_y", "bending_z"), ("torsion", "bending_y", "bending_z"), ("bending_y", "bending_z", "elongation"))
+FREE = (
+    ("bending_y", "bending_z"),
+    ("torsion", "bending_y", "bending_z"),
+    ("bending_y", "bending_z", "elongation"),
+)
 
 
 def stream(effects: Iterable[str]) -> np.random.Generator:
@@ -50,7 +74,8 @@ def stream(effects: Iterable[str]) -> np.random.Generator:
 
 
 class Structure(NamedTuple):
-    """Effects, and on which of the two tendons those act that belong to a tendon; the strains that are free."""
+    """Effects, and on which of the two tendons those act that belong to a tendon; the strains that
+    are free."""
 
     effects: tuple[str, ...]
     pull: tuple[int, ...]
@@ -63,29 +88,41 @@ def structure(effects: frozenset[str]) -> Structure:
     """A subset of the effects, their places drawn, always the same ones."""
     random = stream(effects)
     places = [((0,), (1,), (0, 1))[i] for i in random.integers(3, size=2)]
-    pull, length = (place if name in effects else () for name, place in zip(("pull", "length"), places, strict=True))
+    pull, length = (
+        place if name in effects else ()
+        for name, place in zip(("pull", "length"), places, strict=True)
+    )
     release = places[0] if "release" in effects else ()
     if pull and release:
         pull, release = [((0,), (1,)), ((1,), (0,))][random.integers(2)]
     free = FREE[random.integers(len(FREE))] if "free strains" in effects else None
-    return Structure(tuple(name for name in EFFECTS if name in effects), pull, release, length, free)
+    return Structure(
+        tuple(name for name in EFFECTS if name in effects), pull, release, length, free
+    )
 
 
 def structures(number: int) -> list[Structure]:
-    """All effects together, and then the subset, of a hundred drawn, that adds most triples of effects on or off."""
+    """All effects together, and then the subset, of a hundred drawn, that adds most triples of
+    effects on or off."""
     random, seen = np.random.default_rng(SEED), set()
 
     def triples(effects: frozenset[str]) -> set:
-        return {(names, tuple(name in effects for name in names)) for names in combinations(EFFECTS, 3)}
+        return {
+            (names, tuple(name in effects for name in names)) for names in combinations(EFFECTS, 3)
+        }
 
     def candidate() -> frozenset[str]:
-        chosen = {name for name, on in zip(EFFECTS, random.random(len(EFFECTS)) < 0.5, strict=True) if on}
+        chosen = {
+            name for name, on in zip(EFFECTS, random.random(len(EFFECTS)) < 0.5, strict=True) if on
+        }
         return frozenset(chosen | {NEEDS[name] for name in chosen & set(NEEDS)})
 
     found: list[frozenset[str]] = [frozenset(EFFECTS)]
     while len(found) < number:
         seen |= triples(found[-1])
-        found.append(max((candidate() for _ in range(100)), key=lambda effects: len(triples(effects) - seen)))
+        found.append(
+            max((candidate() for _ in range(100)), key=lambda effects: len(triples(effects) - seen))
+        )
     return [structure(effects) for effects in found[:number]]
 
 
@@ -113,7 +150,11 @@ def drawn(made: Structure, random: np.random.Generator) -> Drawn:
     EI = young * np.pi * base**4 / 4
     density = uniform(0.5, 6.0) * EI / (9.81 * np.pi * base**2 * L**3)
     rest = (*(uniform(-0.7, 0.7, 3) / L), 1 + uniform(-0.05, 0.05), *uniform(-0.03, 0.03, 2))
-    stiff = vsr.Piecewise([uniform(0.3, 0.7) * L], [young, uniform(0.5, 1.0) * young]) if "jumps" in on else young
+    stiff = (
+        vsr.Piecewise([uniform(0.3, 0.7) * L], [young, uniform(0.5, 1.0) * young])
+        if "jumps" in on
+        else young
+    )
     section = vsr.Circular(vsr.Taper(base, uniform(0.7, 1.0) * base))
     material = vsr.Material(stiff, poisson=uniform(0.3, 0.49), density=density)
     pose = vsr.se3.exp(jnp.asarray([*uniform(-1, 1, 3), *uniform(-0.1, 0.1, 3)]))
@@ -123,7 +164,12 @@ def drawn(made: Structure, random: np.random.Generator) -> Drawn:
     if "chamber" in on:
         y, z = uniform(0.2, 0.6, 2) * arm.radius * random.choice([-1, 1], 2)
         area = np.pi * (uniform(0.1, 0.3) * arm.radius) ** 2
-        threads.append((vsr.Chamber(vsr.Linear(y, z, *(uniform(-0.3, 0.3, 2) * arm.radius / L)), area), _pull(arm, random) / area))
+        threads.append(
+            (
+                vsr.Chamber(vsr.Linear(y, z, *(uniform(-0.3, 0.3, 2) * arm.radius / L)), area),
+                _pull(arm, random) / area,
+            )
+        )
     actuators, inputs = zip(*threads, strict=True)
     free = {} if made.free is None else {"free_strains": made.free}
     scene = vsr.Scene(rod, actuators, _loads(on, arm, density, random), **free)
@@ -135,7 +181,9 @@ def _pull(arm: _Arm, random: np.random.Generator) -> float:
     return random.uniform(0.2, 1.5) * arm.bending / (arm.length * 0.6 * arm.radius)
 
 
-def _tendon(made: Structure, place: int, arm: _Arm, random: np.random.Generator) -> tuple[vsr.Tendon, float]:
+def _tendon(
+    made: Structure, place: int, arm: _Arm, random: np.random.Generator
+) -> tuple[vsr.Tendon, float]:
     """A straight tendon or a helical one, and its input."""
     uniform = random.uniform
     radius, phase, force = uniform(0.4, 0.9) * arm.radius, uniform(0, 2 * np.pi), _pull(arm, random)
@@ -146,7 +194,10 @@ def _tendon(made: Structure, place: int, arm: _Arm, random: np.random.Generator)
     elif "jumps" in made.effects:
         options["end"] = uniform(0.75, 0.95) * arm.length
     if place in (*made.pull, *made.release):
-        options |= {"friction": uniform(0.05, 0.5), "motion": "pull" if place in made.pull else "release"}
+        options |= {
+            "friction": uniform(0.05, 0.5),
+            "motion": "pull" if place in made.pull else "release",
+        }
     if place not in made.length:
         return vsr.Tendon(path, **options), force
     axial = 4 * arm.bending / (arm.radius / 0.7) ** 2
@@ -164,21 +215,38 @@ def _loads(on: set[str], arm: _Arm, density: float, random: np.random.Generator)
     unit = arm.bending / arm.length**2
 
     def wrench(frame: Any) -> Any:
-        parts = {"force": uniform(-1, 1, 3) * unit, "moment": uniform(-0.3, 0.3, 3) * unit * arm.length, "frame": frame}
-        return vsr.PointWrench(uniform(0.4, 0.9) * arm.length, **parts) if "jumps" in on else vsr.TipWrench(**parts)
+        parts = {
+            "force": uniform(-1, 1, 3) * unit,
+            "moment": uniform(-0.3, 0.3, 3) * unit * arm.length,
+            "frame": frame,
+        }
+        return (
+            vsr.PointWrench(uniform(0.4, 0.9) * arm.length, **parts)
+            if "jumps" in on
+            else vsr.TipWrench(**parts)
+        )
 
     if "gravity" in on:
         way = random.normal(size=3)
-        loads.append(vsr.Gravity(9.81 * way / np.linalg.norm(way), uniform(0.2, 0.8) * density if "fluid" in on else None))
+        loads.append(
+            vsr.Gravity(
+                9.81 * way / np.linalg.norm(way),
+                uniform(0.2, 0.8) * density if "fluid" in on else None,
+            )
+        )
     if "dead" in on:
         loads.append(wrench("world"))
     if "follower" in on:
-        loads += [wrench("body"), vsr.DistributedWrench(tuple(uniform(-1, 1, 3) * unit / arm.length), frame="body")]
+        loads += [
+            wrench("body"),
+            vsr.DistributedWrench(tuple(uniform(-1, 1, 3) * unit / arm.length), frame="body"),
+        ]
     return loads
 
 
 class Program:
-    """The functions of a structure's scenes that are compiled: f with its derivatives, and f alone."""
+    """The functions of a structure's scenes that are compiled: f with its derivatives, and f
+    alone."""
 
     def __init__(self, like: Drawn, model: Any, random: np.random.Generator):
         _, rebuild = ravel_pytree(like[:2])
@@ -189,7 +257,9 @@ class Program:
             eq = vsr.solve(scene, inputs, model=model)
             grid = vsr.StrainDependent(STEPS).grid(scene)
             pieces = jnp.searchsorted(scene.edges(), grid.start + 0.5 * grid.h)
-            parts = jnp.concatenate([eq.tip[:3, 3] / 0.3, eq.tip[:3, :3].ravel(), eq.forces / force, eq.slack / 0.01])
+            parts = jnp.concatenate(
+                [eq.tip[:3, 3] / 0.3, eq.tip[:3, :3].ravel(), eq.forces / force, eq.slack / 0.01]
+            )
             return mix @ parts, (eq.status, eq.forces == 0, pieces)
 
         def derivatives(x: jax.Array, force: jax.Array, v: jax.Array) -> tuple[jax.Array, ...]:
@@ -201,7 +271,8 @@ class Program:
 
 
 class Found(NamedTuple):
-    """Of one scene: its status, the three derivatives, and the error of the difference by its own estimate (NaN at a switch)."""
+    """Of one scene: its status, the three derivatives, and the error of the difference by its own
+    estimate (NaN at a switch)."""
 
     status: int
     forward: float
@@ -215,7 +286,10 @@ def search(made: Structure, draws: int, model: Any = None) -> list[Found]:
     random = stream(made.effects)
     scenes = [drawn(made, random) for _ in range(draws)]
     program = Program(scenes[0], vsr.StrainDependent(STEPS) if model is None else model, random)
-    x, force = jnp.stack([ravel_pytree(one[:2])[0] for one in scenes]), jnp.asarray([one.force for one in scenes])
+    x, force = (
+        jnp.stack([ravel_pytree(one[:2])[0] for one in scenes]),
+        jnp.asarray([one.force for one in scenes]),
+    )
     v = random.normal(size=x.shape) * np.where(x == 0, 1e-3, np.abs(x))
     forward, reverse = (np.asarray(part) for part in program.derivatives(x, force, v))
     steps = WIDEST * 0.5 ** np.arange(HALVINGS + 1)
@@ -228,12 +302,16 @@ def search(made: Structure, draws: int, model: Any = None) -> list[Found]:
         values = np.where(np.all(told == told[:, :1], axis=2), values, np.nan)
     odd = values[:, 1 : len(steps) + 1] - values[:, len(steps) + 1 :]
     found = [difference(*pair) for pair in zip(odd, np.broadcast_to(steps, odd.shape), strict=True)]
-    return [Found(int(s[0]), float(f), float(r), *d) for s, f, r, d in zip(status, forward, reverse, found, strict=True)]
+    return [
+        Found(int(s[0]), float(f), float(r), *d)
+        for s, f, r, d in zip(status, forward, reverse, found, strict=True)
+    ]
 
 
 def difference(odd: np.ndarray, steps: np.ndarray) -> tuple[float, float]:
-    r"""Fourth-order central difference $(8 (f_h - f_{-h}) - (f_{2h} - f_{-2h})) / 12 h$ and its error, from $f_h - f_{-h}$ at steps that
-    are halved: where it differs least from those of twice and of half the step, and four times what it differs by there."""
+    r"""Fourth-order central difference $(8 (f_h - f_{-h}) - (f_{2h} - f_{-2h})) / 12 h$ and its
+    error, from $f_h - f_{-h}$ at steps that are halved: where it differs least from those of twice
+    and of half the step, and four times what it differs by there."""
     slopes = (8 * odd[1:] - odd[:-1]) / (12 * steps[1:])
     changes = np.abs(np.diff(slopes))
     errors = np.maximum(changes[1:], changes[:-1])
@@ -264,9 +342,17 @@ def summary(found: list[Found]) -> dict[str, Any]:
     """The row of a structure: counts, and the largest relative differences."""
     said = [verdict(one) for one in found]
     counts = {words: said.count(words) for words in sorted(set(said))}
-    solved = [one for one in found if one.status == vsr.Status.CONVERGED and not np.isnan(one.forward + one.reverse)]
+    solved = [
+        one
+        for one in found
+        if one.status == vsr.Status.CONVERGED and not np.isnan(one.forward + one.reverse)
+    ]
     modes = [abs(one.forward - one.reverse) / abs(one.forward) for one in solved]
-    apart = [abs(one.forward - one.difference) / abs(one.forward) for one in solved if one.error <= SAME * abs(one.forward)]
+    apart = [
+        abs(one.forward - one.difference) / abs(one.forward)
+        for one in solved
+        if one.error <= SAME * abs(one.forward)
+    ]
     return {
         "draws": len(found),
         "converged": sum(one.status == vsr.Status.CONVERGED for one in found),
@@ -279,25 +365,39 @@ def summary(found: list[Found]) -> dict[str, Any]:
 def line(name: str, row: dict[str, Any]) -> str:
     """A line of the table."""
     said = row["verdicts"]
-    worst = ("-" if row[key] is None else f"{row[key]:.0e}" for key in ("forward - reverse", "forward - differences"))
+    worst = (
+        "-" if row[key] is None else f"{row[key]:.0e}"
+        for key in ("forward - reverse", "forward - differences")
+    )
     wrong = sum(number for words, number in said.items() if words.startswith("wrong"))
-    counts = (said.get(words, 0) for words in ("NaN in both", "NaN in one mode", "at a switch", "difference too rough"))
+    counts = (
+        said.get(words, 0)
+        for words in ("NaN in both", "NaN in one mode", "at a switch", "difference too rough")
+    )
     cells = (name, row["draws"], row["converged"], *counts, wrong, *worst)
     return f"| {' | '.join(str(cell) for cell in cells)} |"
 
 
 HEADER = (
-    "| effects | draws | converged | NaN in both | NaN in one mode | at a switch | difference too rough | wrong "
+    "| effects | draws | converged | NaN in both | NaN in one mode | at a switch | difference too "
+    "rough | wrong "
     "| forward - reverse | forward - differences |\n|" + "---|" * 10
 )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--structures", type=int, default=12)
-    parser.add_argument("--draws", type=int, default=17, help="of each structure (default: %(default)s)")
     parser.add_argument(
-        "--prescribed", type=int, default=2, help="how many of the structures to solve in a basis too (default: %(default)s)"
+        "--draws", type=int, default=17, help="of each structure (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--prescribed",
+        type=int,
+        default=2,
+        help="how many of the structures to solve in a basis too (default: %(default)s)",
     )
     parser.add_argument("--json", metavar="FILE")
     options = parser.parse_args()
@@ -305,14 +405,26 @@ def main() -> None:
     print(HEADER)
     rows = []
     chosen = structures(options.structures)
-    for made, basis in [*((made, False) for made in chosen), *((made, True) for made in chosen[: options.prescribed])]:
+    for made, basis in [
+        *((made, False) for made in chosen),
+        *((made, True) for made in chosen[: options.prescribed]),
+    ]:
         began = time.perf_counter()
-        jax.clear_caches()  # the programs of a structure are used once and take hundreds of megabytes
+        # the programs of a structure are used once and take hundreds of megabytes
+        jax.clear_caches()
         family = vsr.Basis.uniform(vsr.Legendre(2), *(() if made.free is None else (made.free,)))
         found = search(made, options.draws, vsr.Prescribed(family, steps=STEPS) if basis else None)
         name = ", ".join(made.effects) or "tendons alone"
-        row = {"model": "Prescribed" if basis else "StrainDependent", **made._asdict(), **summary(found)}
-        print(line(name + " (Prescribed)" * basis, row), f"{time.perf_counter() - began:.0f} s", flush=True)
+        row = {
+            "model": "Prescribed" if basis else "StrainDependent",
+            **made._asdict(),
+            **summary(found),
+        }
+        print(
+            line(name + " (Prescribed)" * basis, row),
+            f"{time.perf_counter() - began:.0f} s",
+            flush=True,
+        )
         rows.append({**row, "found": [[verdict(one), *one] for one in found]})
     if options.json:
         record = {"seed": SEED, "steps": STEPS, "jax": jax.__version__, "structures": rows}

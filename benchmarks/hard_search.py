@@ -1,8 +1,9 @@
-"""A search for shapes that are called solutions and are not: hypothesis draws arms of all sizes, threads, loads and forces.
+"""A search for shapes that are called solutions and are not: hypothesis draws arms of all sizes,
+threads, loads and forces.
 
-Of each that converges, code that shares nothing with the package but the numbers of the scene works out the residual from the
-strains; the gradient has to be finite; and twice the steps have to give the same shape. What does not converge has to say why
-and to come as NaN. Run it with
+Of each that converges, code that shares nothing with the package but the numbers of the scene works
+out the residual from the strains; the gradient has to be finite; and twice the steps have to give
+the same shape. What does not converge has to say why and to come as NaN. Run it with
 
     python benchmarks/hard_search.py --json benchmarks/results/hard_search.json
 
@@ -23,20 +24,23 @@ import numpy as np
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 import vsr_jax as vsr
-from vsr_jax.resolution import COARSE
+from vsr_jax.mechanics.resolution import COARSE
 
 STEPS = 16
 SAME = COARSE
-"""Largest distance of the tips of a solve and of one with twice the steps, as a share of the length: what a status promises."""
+"""Largest distance of the tips of a solve and of one with twice the steps, as a share of the
+length: what a status promises."""
 BALANCED = 1e-9, 0.05
-"""Largest imbalance as a share of the wrenches: of threads alone, by rounding; with loads, which the steps carry along the arm."""
+"""Largest imbalance as a share of the wrenches: of threads alone, by rounding; with loads, which
+the steps carry along the arm."""
 STATIONS = 401
 
 
 class Draw(NamedTuple):
-    """An arm in numbers without unit, besides its length [m] and modulus [Pa]: length by diameter, radius of the tip by that of
-    the base, curvature at rest by 1 / L, threads (place by radius, phase, turns), forces by $EI / (L d)$ or EA, weight
-    $\\rho g A L^3 / EI$, direction of gravity, force and moment at the tip by $EI / L^2$ and $EI / L$."""
+    """An arm in numbers without unit, besides its length [m] and modulus [Pa]: length by diameter,
+    radius of the tip by that of the base, curvature at rest by 1 / L, threads (place by radius,
+    phase, turns), forces by $EI / (L d)$ or EA, weight $\\rho g A L^3 / EI$, direction of gravity,
+    force and moment at the tip by $EI / L^2$ and $EI / L$."""
 
     length: float
     young: float
@@ -93,7 +97,13 @@ def built(draw: Draw) -> tuple[vsr.Scene, np.ndarray]:
     weight = 9.81 * math.pi * radius**2 * L**3 / bending  # of a density of one
     material = vsr.Material(draw.young, poisson=0.45, density=max(draw.weight, 1e-12) / weight)
     rest = (0.0, 0.0, draw.curved / L, 1.0, 0.0, 0.0)
-    rod = vsr.Rod(L, vsr.Circular(vsr.Taper(radius, draw.tip * radius)), material, rest_strain=rest, guide_radius=2 * radius)
+    rod = vsr.Rod(
+        L,
+        vsr.Circular(vsr.Taper(radius, draw.tip * radius)),
+        material,
+        rest_strain=rest,
+        guide_radius=2 * radius,
+    )
     threads = [
         vsr.Thread(vsr.Helix(place * radius, pitch=L / turns, phase=phase))
         for place, phase, turns in zip(draw.place, draw.phase, draw.turns, strict=True)
@@ -102,13 +112,19 @@ def built(draw: Draw) -> tuple[vsr.Scene, np.ndarray]:
     if draw.weight > 0:
         loads.append(vsr.Gravity((9.81 * math.sin(draw.down), 0.0, -9.81 * math.cos(draw.down))))
         force = tuple(bending / L**2 * x for x in draw.tip_force)
-        loads.append(vsr.TipWrench(force=force, moment=tuple(bending / L * x for x in draw.tip_moment)))
-    forces = [min(axial, bending / (L * place * radius)) * f for f, place in zip(draw.force, draw.place, strict=True)]
+        loads.append(
+            vsr.TipWrench(force=force, moment=tuple(bending / L * x for x in draw.tip_moment))
+        )
+    forces = [
+        min(axial, bending / (L * place * radius)) * f
+        for f, place in zip(draw.force, draw.place, strict=True)
+    ]
     return vsr.Scene(rod, threads, loads), np.array(forces)
 
 
 class Answer(NamedTuple):
-    """Status, tip [m] and strains at the stations of a solve, the gradient of its tip; status and tip with twice the steps."""
+    """Status, tip [m] and strains at the stations of a solve, the gradient of its tip; status and
+    tip with twice the steps."""
 
     status: np.ndarray
     tip: np.ndarray
@@ -136,7 +152,11 @@ def rotation(k: np.ndarray) -> np.ndarray:
     """Rotation by a vector, after Rodrigues."""
     angle = math.sqrt(k @ k)
     K = np.array([[0, -k[2], k[1]], [k[2], 0, -k[0]], [-k[1], k[0], 0]])
-    a, b = (1 - angle**2 / 6, 0.5 - angle**2 / 24) if angle < 1e-4 else (math.sin(angle) / angle, (1 - math.cos(angle)) / angle**2)
+    a, b = (
+        (1 - angle**2 / 6, 0.5 - angle**2 / 24)
+        if angle < 1e-4
+        else (math.sin(angle) / angle, (1 - math.cos(angle)) / angle**2)
+    )
     return np.eye(3) + a * K + b * K @ K
 
 
@@ -154,19 +174,27 @@ def shape(strain: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def residual(draw: Draw, forces: np.ndarray, strain: np.ndarray) -> float:
-    """Largest imbalance of a cross-section between the first and the last node, as a share of the wrenches in balance there."""
+    """Largest imbalance of a cross-section between the first and the last node, as a share of the
+    wrenches in balance there."""
     L, base = draw.length, draw.length / (2 * draw.slenderness)
     X = np.linspace(0, L, len(strain))
     radius = base * (1 + (draw.tip - 1) * X / L)
     area, second = math.pi * radius**2, math.pi * radius**4 / 4
     shear = draw.young / 2.9
-    stiffness = np.stack([2 * shear * second, *[draw.young * second] * 2, draw.young * area, *[shear * area] * 2], 1)
+    stiffness = np.stack(
+        [2 * shear * second, *[draw.young * second] * 2, draw.young * area, *[shear * area] * 2], 1
+    )
     elastic = stiffness * (strain - np.array([0, 0, draw.curved / L, 1, 0, 0]))
     sizes, total = np.abs(elastic), elastic.copy()
     for place, phase, turns, force in zip(draw.place, draw.phase, draw.turns, forces, strict=True):
         turn = 2 * math.pi * turns / L
         d = place * base * np.stack([0 * X, np.cos(phase + turn * X), np.sin(phase + turn * X)], 1)
-        slope = turn * place * base * np.stack([0 * X, -np.sin(phase + turn * X), np.cos(phase + turn * X)], 1)
+        slope = (
+            turn
+            * place
+            * base
+            * np.stack([0 * X, -np.sin(phase + turn * X), np.cos(phase + turn * X)], 1)
+        )
         t = np.cross(strain[:, :3], d) + strain[:, 3:] + slope
         t /= np.linalg.norm(t, axis=1, keepdims=True)
         wrench = force * np.concatenate([np.cross(d, t), t], 1)
@@ -177,7 +205,10 @@ def residual(draw: Draw, forces: np.ndarray, strain: np.ndarray) -> float:
     scale = np.sqrt(stiffness)
     rounding = 1e-3 * np.sqrt(stiffness[0, 3])  # a billionth of that is 1e-12 as a strain
     seen = np.abs(X / L - 0.5) < 0.5 - 0.12 / STEPS
-    return float(np.max(np.linalg.norm(total / scale, axis=1)[seen]) / (np.max(np.linalg.norm(sizes / scale, axis=1)) + rounding))
+    return float(
+        np.max(np.linalg.norm(total / scale, axis=1)[seen])
+        / (np.max(np.linalg.norm(sizes / scale, axis=1)) + rounding)
+    )
 
 
 def reaction(draw: Draw, strain: np.ndarray) -> np.ndarray:
@@ -188,13 +219,21 @@ def reaction(draw: Draw, strain: np.ndarray) -> np.ndarray:
     X = np.linspace(0, L, len(strain))
     weight = draw.weight * bending / L**3 * (1 + (draw.tip - 1) * X / L) ** 2
     down = np.array([math.sin(draw.down), 0, -math.cos(draw.down)])
-    mass = np.concatenate([np.cumsum((0.5 * (weight[1:] + weight[:-1]) * L / (len(X) - 1))[::-1])[::-1], [0.0]])
+    mass = np.concatenate(
+        [np.cumsum((0.5 * (weight[1:] + weight[:-1]) * L / (len(X) - 1))[::-1])[::-1], [0.0]]
+    )
     moments = 0.5 * (weight[1:, None] * r[1:] + weight[:-1, None] * r[:-1]) * L / (len(X) - 1)
     first = np.concatenate([np.cumsum(moments[::-1], axis=0)[::-1], np.zeros((1, 3))])
     tip = bending / L**2 * np.array(draw.tip_force)
     force = mass[:, None] * down + tip
-    moment = bending / L * np.array(draw.tip_moment) + np.cross(r[-1] - r, tip) + np.cross(first - mass[:, None] * r, down)
-    return np.concatenate([np.einsum("nji,nj->ni", R, moment), np.einsum("nji,nj->ni", R, force)], 1)
+    moment = (
+        bending / L * np.array(draw.tip_moment)
+        + np.cross(r[-1] - r, tip)
+        + np.cross(first - mass[:, None] * r, down)
+    )
+    return np.concatenate(
+        [np.einsum("nji,nj->ni", R, moment), np.einsum("nji,nj->ni", R, force)], 1
+    )
 
 
 def verdict(draw: Draw) -> str:
@@ -207,7 +246,9 @@ def verdict(draw: Draw) -> str:
     if not np.all(np.isfinite(found.gradient)):
         return "wrong: no gradient"
     if found.fine_status != vsr.Status.CONVERGED:
-        return f"converged, but twice the steps say {vsr.Status(int(found.fine_status)).name.lower()}"
+        return (
+            f"converged, but twice the steps say {vsr.Status(int(found.fine_status)).name.lower()}"
+        )
     if not residual(draw, forces, found.strain) < BALANCED[draw.weight > 0]:
         return "wrong: not in balance"
     same = np.linalg.norm(found.fine_tip - found.tip) <= SAME * draw.length
@@ -215,10 +256,17 @@ def verdict(draw: Draw) -> str:
 
 
 def search(examples: int, loaded: bool) -> tuple[Counter, list[tuple[str, Draw]]]:
-    """Verdicts of many draws, the same ones each time, and the draws that went wrong or are in doubt."""
+    """Verdicts of many draws, the same ones each time, and the draws that went wrong or are in
+    doubt."""
     counts, wrong = Counter(), []
 
-    @settings(max_examples=examples, deadline=None, database=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+    @settings(
+        max_examples=examples,
+        deadline=None,
+        database=None,
+        derandomize=True,
+        suppress_health_check=[HealthCheck.too_slow],
+    )
     @given(draws(loaded))
     def look(draw: Draw) -> None:
         said = verdict(draw)
@@ -232,9 +280,18 @@ def search(examples: int, loaded: bool) -> tuple[Counter, list[tuple[str, Draw]]
 
 def main() -> None:
     """Searches without and with loads, and says what came out."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--examples", type=int, default=10_000, help="on threads alone (default: %(default)s)")
-    parser.add_argument("--loaded", type=int, default=1_000, help="with loads, each some forty times slower (default: %(default)s)")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--examples", type=int, default=10_000, help="on threads alone (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--loaded",
+        type=int,
+        default=1_000,
+        help="with loads, each some forty times slower (default: %(default)s)",
+    )
     parser.add_argument("--json", metavar="FILE")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
@@ -242,7 +299,10 @@ def main() -> None:
     for loaded, examples in ((False, options.examples), (True, options.loaded)):
         counts, wrong = search(examples, loaded)
         name = "with loads" if loaded else "threads alone"
-        record[name] = {"verdicts": dict(counts.most_common()), "draws": [[said, draw._asdict()] for said, draw in wrong]}
+        record[name] = {
+            "verdicts": dict(counts.most_common()),
+            "draws": [[said, draw._asdict()] for said, draw in wrong],
+        }
         print(f"{name}: " + ", ".join(f"{count} {said}" for said, count in counts.most_common()))
         for said, draw in wrong[:20]:
             print(f"  {said}: {draw}")

@@ -1,12 +1,14 @@
-"""Whether error estimates are honest and tolerances are met: 200 arms drawn at random, with a fixed seed.
+"""Whether error estimates are honest and tolerances are met: 200 arms drawn at random, with a fixed
+seed.
 
     pip install . && python benchmarks/honest_errors.py [--scenes 50] [--json FILE]
 
-Four kinds of arms, each drawn 50 times: one helical thread; a helix and an oblique thread; a polynomial and a straight thread; a
-helix under gravity with a force and a moment at the tip. Length, taper, modulus, routing, forces and loads are drawn. True errors are
-distances of the tip to a solution of 160 steps (96 under loads); those below the rounding that an estimate never goes below are
-counted apart. The tolerance of each arm is drawn between a hundredth and a ten-millionth of its length; what `solve(...,
-tolerance=...)` chooses for it is then solved and compared.
+Four kinds of arms, each drawn 50 times: one helical thread; a helix and an oblique thread; a
+polynomial and a straight thread; a helix under gravity with a force and a moment at the tip.
+Length, taper, modulus, routing, forces and loads are drawn. True errors are distances of the tip to
+a solution of 160 steps (96 under loads); those below the rounding that an estimate never goes below
+are counted apart. The tolerance of each arm is drawn between a hundredth and a ten-millionth of its
+length; what `solve(..., tolerance=...)` chooses for it is then solved and compared.
 """
 
 import argparse
@@ -16,7 +18,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0")  # nothing is timed
+os.environ.setdefault(
+    "XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
+)  # nothing is timed
 
 import jax
 import jax.numpy as jnp
@@ -45,30 +49,41 @@ class Drawn(NamedTuple):
 
 
 def arm(random: np.random.Generator) -> tuple[vsr.Rod, float, float]:
-    """An arm, its base radius, and the force [N] by which a thread on half that radius bends it by one radian."""
+    """An arm, its base radius, and the force [N] by which a thread on half that radius bends it by
+    one radian."""
     length, slender = 10 ** random.uniform(-1.5, 0.5), random.uniform(10, 80)
     radius, young = length / (2 * slender), 10 ** random.uniform(5, 7)
     rod = vsr.Rod(
-        length, vsr.Circular(vsr.Taper(radius, random.uniform(0.5, 1.0) * radius)), vsr.Material(young, poisson=0.45, density=1000.0)
+        length,
+        vsr.Circular(vsr.Taper(radius, random.uniform(0.5, 1.0) * radius)),
+        vsr.Material(young, poisson=0.45, density=1000.0),
     )
     return rod, radius, young * np.pi * radius**4 / 4 / (length * radius / 2)
 
 
 def helix(random: np.random.Generator, rod: vsr.Rod, radius: float) -> vsr.Helix:
     turns = 10 ** random.uniform(-0.5, 0.9)
-    return vsr.Helix(random.uniform(0.1, 0.45) * radius, pitch=float(rod.length) / turns, phase=random.uniform(0, 6))
+    return vsr.Helix(
+        random.uniform(0.1, 0.45) * radius,
+        pitch=float(rod.length) / turns,
+        phase=random.uniform(0, 6),
+    )
 
 
 def one(random: np.random.Generator) -> tuple[vsr.Scene, list[float]]:
     rod, radius, force = arm(random)
-    return vsr.Scene(rod, [vsr.Tendon(helix(random, rod, radius))]), [force * random.uniform(0.3, 4)]
+    return vsr.Scene(rod, [vsr.Tendon(helix(random, rod, radius))]), [
+        force * random.uniform(0.3, 4)
+    ]
 
 
 def two(random: np.random.Generator) -> tuple[vsr.Scene, list[float]]:
     rod, radius, force = arm(random)
     y, z = random.uniform(-0.25, 0.25, 2) * radius
     oblique = vsr.Linear(y, z, *(random.uniform(-0.2, 0.2, 2) * radius / float(rod.length)))
-    return vsr.Scene(rod, [vsr.Tendon(helix(random, rod, radius)), vsr.Tendon(oblique)]), list(force * random.uniform(0.3, 2, 2))
+    return vsr.Scene(rod, [vsr.Tendon(helix(random, rod, radius)), vsr.Tendon(oblique)]), list(
+        force * random.uniform(0.3, 2, 2)
+    )
 
 
 def bent(random: np.random.Generator) -> tuple[vsr.Scene, list[float]]:
@@ -88,7 +103,9 @@ def loaded(random: np.random.Generator) -> tuple[vsr.Scene, list[float]]:
         force=tuple(bending / float(rod.length) ** 2 * random.uniform(-1, 1, 3)),
         moment=tuple(bending / float(rod.length) * random.uniform(-0.5, 0.5, 3)),
     )
-    return vsr.Scene(rod, [vsr.Tendon(helix(random, rod, radius))], [gravity, tip]), [force * random.uniform(0.3, 2)]
+    return vsr.Scene(rod, [vsr.Tendon(helix(random, rod, radius))], [gravity, tip]), [
+        force * random.uniform(0.3, 2)
+    ]
 
 
 def _direction(random: np.random.Generator) -> np.ndarray:
@@ -112,7 +129,9 @@ def draw(kind: str, number: int, random: np.random.Generator) -> Drawn:
     return Drawn(stacked, jnp.asarray(inputs), lengths * 10 ** random.uniform(-7, -2, number))
 
 
-def tips(drawn: Drawn, model: vsr.StrainDependent | vsr.Prescribed, *, error: bool) -> tuple[np.ndarray, np.ndarray]:
+def tips(
+    drawn: Drawn, model: vsr.StrainDependent | vsr.Prescribed, *, error: bool
+) -> tuple[np.ndarray, np.ndarray]:
     """Place of each tip [m], and the estimated error."""
 
     def of(scene: vsr.Scene, inputs: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -124,9 +143,12 @@ def tips(drawn: Drawn, model: vsr.StrainDependent | vsr.Prescribed, *, error: bo
 
 
 def study(kind: str, number: int, random: np.random.Generator) -> dict[str, Any]:
-    """Ratios of estimated to true errors by model, and how the errors at the chosen steps compare with the tolerances."""
+    """Ratios of estimated to true errors by model, and how the errors at the chosen steps compare
+    with the tolerances."""
     drawn = draw(kind, number, random)
-    exact, _ = tips(drawn, vsr.StrainDependent(96 if kind == "helix under loads" else 160), error=False)
+    exact, _ = tips(
+        drawn, vsr.StrainDependent(96 if kind == "helix under loads" else 160), error=False
+    )
     length = np.asarray(drawn.scenes.rod.length)
     found: dict[str, Any] = {}
     for name, model in MODELS.items():
@@ -166,19 +188,29 @@ def summary(results: dict[str, Any]) -> list[str]:
     text = []
     for name in MODELS:
         rows = [kind["estimates"][name] for kind in results.values()]
-        solved, honest = (sum(row[key] for row in rows) for key in ("solved", "at most the estimate"))
+        solved, honest = (
+            sum(row[key] for row in rows) for key in ("solved", "at most the estimate")
+        )
         ratios = np.concatenate([row["ratios"] for row in rows])
         low, median, high = np.quantile(ratios, [0.05, 0.5, 0.95])
         text.append(
-            f"{name}: {honest} of {solved} true errors at most the estimate; above rounding that is {median:.2f} times the true error "
-            f"(5 to 95 %: {low:.2f} to {high:.2f}), at most 20 times in {100 * np.mean(ratios <= 20):.1f} %"
+            f"{name}: {honest} of {solved} true errors at most the estimate; above rounding that "
+            f"is {median:.2f} times the true error "
+            f"(5 to 95 %: {low:.2f} to {high:.2f}), at most 20 times in "
+            f"{100 * np.mean(ratios <= 20):.1f} %"
         )
     met = [kind["tolerances"] for kind in results.values()]
-    return [*text, f"tolerances met: {sum(row['met'] for row in met)} of {sum(row['solved'] for row in met)} solved"]
+    return [
+        *text,
+        f"tolerances met: {sum(row['met'] for row in met)} of {sum(row['solved'] for row in met)} "
+        f"solved",
+    ]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--scenes", type=int, default=50, help="of each kind")
     parser.add_argument("--json", metavar="FILE")
     options = parser.parse_args()
@@ -187,7 +219,9 @@ def main() -> None:
     results = {kind: study(kind, options.scenes, random) for kind in KINDS}
     print("\n".join(summary(results)))
     if options.json:
-        Path(options.json).write_text(json.dumps({"seed": SEED, "jax": jax.__version__, "kinds": results}, indent=1) + "\n")
+        Path(options.json).write_text(
+            json.dumps({"seed": SEED, "jax": jax.__version__, "kinds": results}, indent=1) + "\n"
+        )
 
 
 if __name__ == "__main__":

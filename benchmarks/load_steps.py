@@ -1,18 +1,23 @@
-r"""An independent path to a stable equilibrium: load steps from no load with Newton's method on a dense system, in NumPy alone.
+r"""An independent path to a stable equilibrium: load steps from no load with Newton's method on a
+dense system, in NumPy alone.
 
-It shares nothing with the package but the numbers of a scene (see `ordinary_scenes`). The arm is N elements of one strain each; lengths
-are in units of L and forces in $EI / L^2$ of the base. In balance is, at the middle of each element,
+It shares nothing with the package but the numbers of a scene (see `ordinary_scenes`). The arm is N
+elements of one strain each; lengths are in units of L and forces in $EI / L^2$ of the base. In
+balance is, at the middle of each element,
 
 $$r_i = \Sigma (\xi_i - \xi^*) - B \tau_i - Ad(g_i)^T W_i,$$
 
-with $W_i$ the loads beyond, as wrenches about the origin of space. A change of strain moves all that lies beyond by the twist
-$h\,Ad(g_i)\,\delta\xi_i$; so the tangent is known in closed form, to second order in h, and dense. Tendons driven by length add their
-tension as an unknown and $\min(T, s) = 0$ as an equation, with s their slack. Friction takes the shares of the last iterate.
+with $W_i$ the loads beyond, as wrenches about the origin of space. A change of strain moves all
+that lies beyond by the twist $h\,Ad(g_i)\,\delta\xi_i$; so the tangent is known in closed form, to
+second order in h, and dense. Tendons driven by length add their tension as an unknown and $\min(T,
+s) = 0$ as an equation, with s their slack. Friction takes the shares of the last iterate.
 
-Stability is that of an arm whose curvature and twist creep in proportion to their stiffness, all else in balance: by the eigenvalues of
-the scaled tangent. A path ends where a real one ceases to be positive: there the arm snaps. Pairs of complex ones with a negative
-real part, which only loads without potential can make (follower wrenches, dead moments in space, friction), are flutter. A step that
-turns the arm by more than `MOST_TURN` is halved, so that the path leads from one equilibrium to its neighbour.
+Stability is that of an arm whose curvature and twist creep in proportion to their stiffness, all
+else in balance: by the eigenvalues of the scaled tangent. A path ends where a real one ceases to be
+positive: there the arm snaps. Pairs of complex ones with a negative real part, which only loads
+without potential can make (follower wrenches, dead moments in space, friction), are flutter. A step
+that turns the arm by more than `MOST_TURN` is halved, so that the path leads from one equilibrium
+to its neighbour.
 """
 
 from typing import Any, NamedTuple
@@ -37,8 +42,8 @@ class Margin(NamedTuple):
 
 
 class Path(NamedTuple):
-    """Where a path ended: the share of loads and inputs reached, stability margin there, the least real one on the way, and strains and
-    tensions of the cables."""
+    """Where a path ended: the share of loads and inputs reached, stability margin there, the least
+    real one on the way, and strains and tensions of the cables."""
 
     share: float
     margin: Margin
@@ -73,7 +78,8 @@ class Arm:
         self._wrenches(structure, n, L, bending, area)
 
     def _threads(self, structure: Any, n: dict[str, Any], L: Any, bending: Any) -> None:
-        """Places of the tendons in the sections, how much of each element they run through, inputs, friction, elasticity."""
+        """Places of the tendons in the sections, how much of each element they run through, inputs,
+        friction, elasticity."""
         tendons, X = structure.tendons, self.middle
         self.paths = []
         for i in range(len(tendons)):
@@ -89,12 +95,23 @@ class Arm:
         unit = [units[laid.control] for laid in tendons]
         self.inputs = n["inputs"] / np.array(unit) if tendons else np.zeros(0)
         signs = {"pull": 1.0, "release": -1.0, None: 0.0}
-        self.friction = [signs[laid.motion] * n["friction"][i] if laid.motion else 0.0 for i, laid in enumerate(tendons)]
-        self.compliance = [force / n["stiffness"][i] if laid.elastic else 0.0 for i, laid in enumerate(tendons)]
-        self.rest_length = [np.sum(self.h * self.reach[i] * self._tangent(self.rest, i)[1]) for i in range(len(tendons))]
+        self.friction = [
+            signs[laid.motion] * n["friction"][i] if laid.motion else 0.0
+            for i, laid in enumerate(tendons)
+        ]
+        self.compliance = [
+            force / n["stiffness"][i] if laid.elastic else 0.0 for i, laid in enumerate(tendons)
+        ]
+        self.rest_length = [
+            np.sum(self.h * self.reach[i] * self._tangent(self.rest, i)[1])
+            for i in range(len(tendons))
+        ]
 
-    def _wrenches(self, structure: Any, n: dict[str, Any], L: Any, bending: Any, area: np.ndarray) -> None:
-        """Each load as (element, how much of it lies before the load, moment, force, whether it follows)."""
+    def _wrenches(
+        self, structure: Any, n: dict[str, Any], L: Any, bending: Any, area: np.ndarray
+    ) -> None:
+        """Each load as (element, how much of it lies before the load, moment, force, whether it
+        follows)."""
         self.loads = []
         unit = bending / L**2
         if structure.gravity:
@@ -105,7 +122,10 @@ class Arm:
             force, moment = n[f"{name} force"] / unit, n[f"{name} moment"] / (unit * L)
             if kind == "spread":
                 part = self.h * L
-                self.loads += [(i, 0.5, part * moment, part * force, frame == "body") for i in range(self.count)]
+                self.loads += [
+                    (i, 0.5, part * moment, part * force, frame == "body")
+                    for i in range(self.count)
+                ]
                 continue
             place = self.count * (1.0 if kind == "tip" else float(n["point"] / L))
             element = min(int(place), self.count - 1)
@@ -120,14 +140,16 @@ class Arm:
         """How much of each element (row) lies before each load (column)."""
 
     def _tangent(self, xi: np.ndarray, i: int) -> tuple[np.ndarray, np.ndarray]:
-        """Unit tangent of a thread in the sections' frames, and the length of its path per length of the arm."""
+        """Unit tangent of a thread in the sections' frames, and the length of its path per length
+        of the arm."""
         d, slope = self.paths[i]
         t = np.cross(xi[:, :3], d) + xi[:, 3:] + slope
         size = np.linalg.norm(t, axis=1)
         return t / size[:, None], size
 
     def poses(self, xi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Poses at the start of each element and at the tip (N + 1), and at the middle of each (N), shape (., 4, 4)."""
+        """Poses at the start of each element and at the tip (N + 1), and at the middle of each (N),
+        shape (., 4, 4)."""
         whole, half = _exp(self.h * xi), _exp(0.5 * self.h * xi)
         ends = np.empty((self.count + 1, 4, 4))
         ends[0] = np.eye(4)
@@ -135,7 +157,9 @@ class Arm:
             ends[i + 1] = ends[i] @ step
         return ends, ends[:-1] @ half
 
-    def system(self, xi: np.ndarray, tension: np.ndarray, s: float) -> tuple[np.ndarray, np.ndarray]:
+    def system(
+        self, xi: np.ndarray, tension: np.ndarray, s: float
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Residual (6 N + cables) and its derivative."""
         N, h = self.count, self.h
         ends, middle = self.poses(xi)
@@ -146,7 +170,9 @@ class Arm:
         H[:, range(6), range(6)] = self.stiffness
         left, right = np.swapaxes(A, 1, 2), A
         below, above = (x.transpose(1, 0, 2).reshape(6, -1) for x in (right, -h * C @ right))
-        J = np.where(_lower(N), (-h * left @ (P + C)).reshape(-1, 6) @ below, left.reshape(-1, 6) @ above)
+        J = np.where(
+            _lower(N), (-h * left @ (P + C)).reshape(-1, 6) @ below, left.reshape(-1, 6) @ above
+        )
         H -= h * left @ (0.5 * P + diagonal) @ right
         rows, columns = [], []
         for i, (d, _) in enumerate(self.paths):
@@ -166,10 +192,14 @@ class Arm:
         r, J = h * r.reshape(-1), h * J
         if rows:
             slack, by_strain, by_tension = (np.array(x) for x in zip(*rows, strict=True))
-            return np.append(r, slack), np.block([[J, np.array(columns).T], [by_strain, np.diag(by_tension)]])
+            return np.append(r, slack), np.block(
+                [[J, np.array(columns).T], [by_strain, np.diag(by_tension)]]
+            )
         return r, J
 
-    def _cable(self, i: int, T: float, s: float, share: np.ndarray, size: np.ndarray, B: np.ndarray) -> tuple:
+    def _cable(
+        self, i: int, T: float, s: float, share: np.ndarray, size: np.ndarray, B: np.ndarray
+    ) -> tuple:
         """Equation of a cable, and its derivatives by the strain and by its tension."""
         reach, given = self.reach[i], self.rest_length[i] + s * self.inputs[i]
         mean = np.sum(share) / np.sum(reach)
@@ -185,12 +215,15 @@ class Arm:
         if not self.friction[i]:
             return self.reach[i]
         t = np.einsum("nij,nj->ni", middle[:, :3, :3], t)
-        angle = np.arctan2(np.linalg.norm(np.cross(t[:-1], t[1:]), axis=1), np.sum(t[:-1] * t[1:], 1))
+        angle = np.arctan2(
+            np.linalg.norm(np.cross(t[:-1], t[1:]), axis=1), np.sum(t[:-1] * t[1:], 1)
+        )
         first = 0.5 * angle[:1]  # from the base to the middle of the first element
         return self.reach[i] * np.exp(-self.friction[i] * np.cumsum(np.concatenate([first, angle])))
 
     def _carried(self, xi: np.ndarray, ends: np.ndarray, s: float) -> tuple[np.ndarray, ...]:
-        """Wrench beyond the middle of each element about the origin, what its frame's twist makes of it, and its derivative by twists."""
+        """Wrench beyond the middle of each element about the origin, what its frame's twist makes
+        of it, and its derivative by twists."""
         N = self.count
         if not len(self.element):
             return np.zeros((N, 6)), *(np.zeros((N, 6, 6)) for _ in range(3))
@@ -202,7 +235,9 @@ class Arm:
         w = np.concatenate([m + np.cross(r, f), f], 1)
         D = np.where(self.follows[:, None, None], -_turned(w), 0.0)
         F, zero = _skew(f), np.zeros((len(w), 3, 3))
-        dead = np.concatenate([np.concatenate([F @ _skew(r), -F], 2), np.concatenate([zero, zero], 2)], 1)
+        dead = np.concatenate(
+            [np.concatenate([F @ _skew(r), -F], 2), np.concatenate([zero, zero], 2)], 1
+        )
         D = np.where(self.follows[:, None, None], D, dead)
         W = self.beyond @ w
         C, diagonal = (np.tensordot(b, D, 1) for b in (self.beyond, self.beyond**2))
@@ -212,17 +247,24 @@ class Arm:
         """Stability from the tangent by curvature and twist, with all else in balance."""
         bent = np.arange(6 * self.count).reshape(-1, 6)[:, :3].reshape(-1)
         others = np.setdiff1d(np.arange(len(J)), bent)
-        K = J[np.ix_(bent, bent)] - J[np.ix_(bent, others)] @ np.linalg.solve(J[np.ix_(others, others)], J[np.ix_(others, bent)])
+        K = J[np.ix_(bent, bent)] - J[np.ix_(bent, others)] @ np.linalg.solve(
+            J[np.ix_(others, others)], J[np.ix_(others, bent)]
+        )
         root = np.sqrt(self.h * self.stiffness[:, :3].reshape(-1))
         K = K / (root[:, None] * root)
         least = np.linalg.eigvalsh(0.5 * (K + K.T))[0]
         if least > 0:  # then so are the real parts of all
             return Margin(float(least), float(least))
         values = np.linalg.eigvals(K)
-        return Margin(float(np.min(values.real[values.imag == 0], initial=1.0)), float(np.min(values.real)))
+        return Margin(
+            float(np.min(values.real[values.imag == 0], initial=1.0)), float(np.min(values.real))
+        )
 
-    def balance(self, xi: np.ndarray, tension: np.ndarray, s: float) -> tuple[np.ndarray, np.ndarray, Margin] | None:
-        """Strains, tensions and stability margin of the equilibrium near a start; None if Newton's method does not get there."""
+    def balance(
+        self, xi: np.ndarray, tension: np.ndarray, s: float
+    ) -> tuple[np.ndarray, np.ndarray, Margin] | None:
+        """Strains, tensions and stability margin of the equilibrium near a start; None if Newton's
+        method does not get there."""
         size = 6 * self.count
         weight = np.sqrt(self.h * self.stiffness)
         for _ in range(MOST_ITERATIONS[any(self.friction)]):
@@ -248,7 +290,9 @@ class Arm:
         while s < 1 and least > 0 and step > LEAST_STEP:
             there = min(1.0, s + step)
             ahead = (there - s) / (s - last[2]) if s > 0 else 0.0
-            found = self.balance(xi + ahead * (xi - last[0]), tension + ahead * (tension - last[1]), there)
+            found = self.balance(
+                xi + ahead * (xi - last[0]), tension + ahead * (tension - last[1]), there
+            )
             far = found is None or np.sum(np.abs(found[0] - xi)[:, :3]) * self.h > MOST_TURN
             if found is None or far or (found[2].real <= 0 and step > 2 * LEAST_STEP):
                 step /= 2
@@ -276,7 +320,9 @@ def _lower(count: int) -> np.ndarray:
 def _skew(v: np.ndarray) -> np.ndarray:
     x, y, z = np.moveaxis(v, -1, 0)
     zero = np.zeros_like(x)
-    return np.stack([np.stack([zero, -z, y], -1), np.stack([z, zero, -x], -1), np.stack([-y, x, zero], -1)], -2)
+    return np.stack(
+        [np.stack([zero, -z, y], -1), np.stack([z, zero, -x], -1), np.stack([-y, x, zero], -1)], -2
+    )
 
 
 def _adjoint(g: np.ndarray) -> np.ndarray:
@@ -295,9 +341,17 @@ def _exp(x: np.ndarray) -> np.ndarray:
     k, u = x[:, :3], x[:, 3:]
     square = np.sum(k**2, 1)[:, None, None]
     angle = np.sqrt(np.maximum(square, 1e-16))
-    a, b, c = np.sin(angle) / angle, (1 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
+    a, b, c = (
+        np.sin(angle) / angle,
+        (1 - np.cos(angle)) / angle**2,
+        (angle - np.sin(angle)) / angle**3,
+    )
     small = square < 1e-6
-    a, b, c = np.where(small, 1 - square / 6, a), np.where(small, 0.5 - square / 24, b), np.where(small, 1 / 6 - square / 120, c)
+    a, b, c = (
+        np.where(small, 1 - square / 6, a),
+        np.where(small, 0.5 - square / 24, b),
+        np.where(small, 1 / 6 - square / 120, c),
+    )
     K = _skew(k)
     g = np.zeros((len(x), 4, 4))
     g[:, 3, 3] = 1

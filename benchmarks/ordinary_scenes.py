@@ -1,12 +1,15 @@
-"""Scenes of an ordinary size, drawn at random: what a solver should never refuse while they have a stable equilibrium.
+"""Scenes of an ordinary size, drawn at random: what a solver should never refuse while they have a
+stable equilibrium.
 
-A `Structure` says what a scene has: tendons (by tension or length, elastic or not, with friction, ending on the way) and loads. It
-is static: all draws of a structure are solved by one compiled program. A draw is a dictionary of numbers in SI units, each a float or
-a list, that `built` turns into a scene and its inputs; a copy of the dictionary is all that a test needs.
+A `Structure` says what a scene has: tendons (by tension or length, elastic or not, with friction,
+ending on the way) and loads. It is static: all draws of a structure are solved by one compiled
+program. A draw is a dictionary of numbers in SI units, each a float or a list, that `built` turns
+into a scene and its inputs; a copy of the dictionary is all that a test needs.
 
-Sizes: $L / r$ from 10 to 3000; taper to half the radius; curved at rest in half of the draws; weight $\\rho g A L^3 / EI$ up to 30 in
-any direction; forces up to $10\\,EI / L^2$, moments up to $5\\,EI / L$; tendons at 0.2 to 0.9 of the guide radius that together bend
-the arm by about half a turn.
+Sizes: $L / r$ from 10 to 3000; taper to half the radius; curved at rest in half of the draws;
+weight $\\rho g A L^3 / EI$ up to 30 in any direction; forces up to $10\\,EI / L^2$, moments up to
+$5\\,EI / L$; tendons at 0.2 to 0.9 of the guide radius that together bend the arm by about half a
+turn.
 """
 
 from collections.abc import Callable
@@ -28,7 +31,8 @@ COLLAPSE_SHARE = 0.2
 
 
 class Laid(NamedTuple):
-    """A tendon of a structure, or a chamber: how it is driven, whether it is elastic, rubs, winds or ends before the tip."""
+    """A tendon of a structure, or a chamber: how it is driven, whether it is elastic, rubs, winds
+    or ends before the tip."""
 
     control: Literal["tension", "length", "pressure"] = "tension"
     elastic: bool = False
@@ -38,7 +42,8 @@ class Laid(NamedTuple):
 
 
 class Structure(NamedTuple):
-    """What a scene has: tendons; gravity; wrenches by name, see `_loads`; and how its numbers are drawn."""
+    """What a scene has: tendons; gravity; wrenches by name, see `_loads`; and how its numbers are
+    drawn."""
 
     tendons: tuple[Laid, ...] = ()
     gravity: bool = False
@@ -73,7 +78,9 @@ def built(structure: Structure, numbers: Numbers, share: Any = 1.0) -> tuple[vsr
                 motion=laid.motion or "pull",
             )
         )
-    return vsr.Scene(rod, tendons, _loads(structure, n, share)), share * n["inputs"] if tendons else jnp.zeros(0)
+    return vsr.Scene(rod, tendons, _loads(structure, n, share)), share * n[
+        "inputs"
+    ] if tendons else jnp.zeros(0)
 
 
 def _loads(structure: Structure, n: Numbers, share: Any) -> list[Any]:
@@ -103,23 +110,40 @@ def ordinary(structure: Structure, random: np.random.Generator) -> Numbers:
         "poisson": random.uniform(0.2, 0.49),
         "guide_radius": radius * random.uniform(1.0, 2.0),
         "curvature": random.uniform(-2, 2, 2) / length * (random.random() < 0.5),
-        "gravity": _direction(random) * MOST_WEIGHT * random.random() ** 2 * bending / length**3 / (DENSITY * np.pi * radius**2),
+        "gravity": _direction(random)
+        * MOST_WEIGHT
+        * random.random() ** 2
+        * bending
+        / length**3
+        / (DENSITY * np.pi * radius**2),
         "point": length * random.uniform(0.3, 0.9),
     }
     for name in structure.wrenches:
         unit = bending / length if name.startswith("spread") else bending
-        numbers[f"{name} force"] = _direction(random) * MOST_FORCE * random.random() ** 2 * unit / length**2
-        numbers[f"{name} moment"] = _direction(random) * MOST_MOMENT * random.random() ** 2 * unit / length
+        numbers[f"{name} force"] = (
+            _direction(random) * MOST_FORCE * random.random() ** 2 * unit / length**2
+        )
+        numbers[f"{name} moment"] = (
+            _direction(random) * MOST_MOMENT * random.random() ** 2 * unit / length
+        )
     return plain(numbers | _tendons(structure, random, numbers))
 
 
 def _tendons(structure: Structure, random: np.random.Generator, numbers: Numbers) -> Numbers:
     """Where the tendons lie and how they are driven."""
-    count, length, taper = len(structure.tendons), numbers["length"], numbers["tip_radius"] / numbers["radius"]
+    count, length, taper = (
+        len(structure.tendons),
+        numbers["length"],
+        numbers["tip_radius"] / numbers["radius"],
+    )
     if not count:
         return {}
     place = numbers["guide_radius"] * random.uniform(0.2, 0.9, count)
-    phase = random.uniform(0, 2 * np.pi) + 2 * np.pi * np.arange(count) / count + random.uniform(-0.3, 0.3, count)
+    phase = (
+        random.uniform(0, 2 * np.pi)
+        + 2 * np.pi * np.arange(count) / count
+        + random.uniform(-0.3, 0.3, count)
+    )
     winds = np.array([laid.winds for laid in structure.tendons])
     axial = numbers["young"] * np.pi * numbers["tip_radius"] ** 2
     compliance = (taper**-3 - 1) / (3 * (1 - taper)) if taper < 0.999 else 1.0
@@ -128,11 +152,17 @@ def _tendons(structure: Structure, random: np.random.Generator, numbers: Numbers
     share = np.minimum(1.0, 2.0 / count)
     tension = random.random(count) * share * np.minimum(MOST_BEND * bend, COLLAPSE_SHARE * collapse)
     driven = np.array([laid.control == "length" for laid in structure.tendons])
-    # lengths of an arm bent in one plane, each drawn in or let out a little besides, by no more than the tension above stretches it
+    # lengths of an arm bent in one plane, each drawn in or let out a little besides, by no more
+    # than the tension above stretches it
     angle, plane = MOST_BEND * random.random(), random.uniform(0, 2 * np.pi)
     wound = np.where(winds, 0.3, 1.0)
-    more = np.minimum(0.1 * place * random.uniform(-1, 1, count), share * COLLAPSE_SHARE * collapse * length / axial)
-    change = np.maximum(-place * angle * np.cos(phase - plane) * wound + more, -COLLAPSE_SHARE * length)
+    more = np.minimum(
+        0.1 * place * random.uniform(-1, 1, count),
+        share * COLLAPSE_SHARE * collapse * length / axial,
+    )
+    change = np.maximum(
+        -place * angle * np.cos(phase - plane) * wound + more, -COLLAPSE_SHARE * length
+    )
     return {
         "place": place,
         "phase": phase,
@@ -145,7 +175,8 @@ def _tendons(structure: Structure, random: np.random.Generator, numbers: Numbers
 
 
 def catheter(structure: Structure, random: np.random.Generator) -> Numbers:
-    """A stiff slender catheter with four tendons near its wall, 0 to 3 N each, and 0.5 N at the tip in any direction."""
+    """A stiff slender catheter with four tendons near its wall, 0 to 3 N each, and 0.5 N at the tip
+    in any direction."""
     return plain(
         {
             "length": 0.2,
@@ -166,7 +197,8 @@ def catheter(structure: Structure, random: np.random.Generator) -> Numbers:
 
 
 def upright(structure: Structure, random: np.random.Generator) -> Numbers:
-    """A silicone arm upright under its weight, from half to some times what its modulus can bear, its chamber at no pressure."""
+    """A silicone arm upright under its weight, from half to some times what its modulus can bear,
+    its chamber at no pressure."""
     gravity = np.array([-9.81, 0.0, 0.0])
     return plain(
         {
@@ -204,10 +236,22 @@ STRUCTURES = {
     "catheter": Structure((TENSION,) * 4, False, ("tip world",), catheter),
     "upright, chamber at rest": Structure((Laid("pressure"),), True, (), upright),
     "follower wrenches": Structure((), True, ("tip body", "spread body")),
-    "dead wrenches, three tendons": Structure((TENSION, WOUND, Laid(ends=True)), True, ("point world", "spread world")),
+    "dead wrenches, three tendons": Structure(
+        (TENSION, WOUND, Laid(ends=True)), True, ("point world", "spread world")
+    ),
     "nine tendons": Structure((TENSION, WOUND, Laid(ends=True)) * 3, True, ("tip body",)),
     "three lengths": Structure((LENGTH,) * 3, True, ("tip world",)),
-    "lengths and tensions": Structure((LENGTH, Laid("length", elastic=True, winds=True), TENSION, Laid(ends=True)), False, ("tip world",)),
-    "friction": Structure((Laid(motion="pull"), Laid(motion="pull", winds=True), Laid(motion="release")), True, ("tip world",)),
-    "friction, lengths": Structure((Laid("length", motion="pull"), Laid("length", motion="pull", winds=True), TENSION), True),
+    "lengths and tensions": Structure(
+        (LENGTH, Laid("length", elastic=True, winds=True), TENSION, Laid(ends=True)),
+        False,
+        ("tip world",),
+    ),
+    "friction": Structure(
+        (Laid(motion="pull"), Laid(motion="pull", winds=True), Laid(motion="release")),
+        True,
+        ("tip world",),
+    ),
+    "friction, lengths": Structure(
+        (Laid("length", motion="pull"), Laid("length", motion="pull", winds=True), TENSION), True
+    ),
 }

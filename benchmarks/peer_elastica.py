@@ -1,8 +1,10 @@
-"""PyElastica's side of bench_peers: dynamics with damping, run until the arm is at rest, as its users find statics.
+"""PyElastica's side of bench_peers: dynamics with damping, run until the arm is at rest, as its
+users find statics.
 
-PyElastica has no tendons. The thread is a polygon through one point of each element and its ends; its force pulls at each point
-along both neighbouring sides, half on each node of the element, and turns the element by its arm. The shear stiffness is that of the
-other tools, without the factor 27/28 that PyElastica puts in.
+PyElastica has no tendons. The thread is a polygon through one point of each element and its ends;
+its force pulls at each point along both neighbouring sides, half on each node of the element, and
+turns the element by its arm. The shear stiffness is that of the other tools, without the factor
+27/28 that PyElastica puts in.
 """
 
 from typing import Any
@@ -12,7 +14,8 @@ import numpy as np
 
 
 class Pull(ea.NoForces):
-    """Tension T [N] of a thread at the places d of the elements, shape (3, elements), in their frames."""
+    """Tension T [N] of a thread at the places d of the elements, shape (3, elements), in their
+    frames."""
 
     def __init__(self, tension: float, places: np.ndarray):
         super().__init__()
@@ -23,7 +26,9 @@ class Pull(ea.NoForces):
         x, Q, d = system.position_collection, system.director_collection, self.places
         middle = 0.5 * (x[:, :-1] + x[:, 1:])
         arm = np.einsum("jie,je->ie", Q, d)
-        points = np.concatenate([x[:, :1] + arm[:, :1], middle + arm, x[:, -1:] + arm[:, -1:]], axis=1)
+        points = np.concatenate(
+            [x[:, :1] + arm[:, :1], middle + arm, x[:, -1:] + arm[:, -1:]], axis=1
+        )
         sides = np.diff(points, axis=1)
         sides /= np.linalg.norm(sides, axis=0)
         force = self.tension * (sides[:, 1:] - sides[:, :-1])
@@ -39,8 +44,16 @@ class Scene(ea.BaseSystemCollection, ea.Constraints, ea.Forcing, ea.Damping):
     """What PyElastica integrates."""
 
 
-def tip(scene: dict[str, Any], tau: float, elements: int, seconds: float, density: float = 1000.0, damping: float = 1.5) -> np.ndarray:
-    """Position of the tip [m] when the arm has had `seconds` to come to rest; its density only sets the clock."""
+def tip(
+    scene: dict[str, Any],
+    tau: float,
+    elements: int,
+    seconds: float,
+    density: float = 1000.0,
+    damping: float = 1.5,
+) -> np.ndarray:
+    """Position of the tip [m] when the arm has had `seconds` to come to rest; its density only sets
+    the clock."""
     length, radius, helix = scene["length"], scene["radius"], scene["helix"]
     rod = ea.CosseratRod.straight_rod(
         elements,
@@ -54,14 +67,20 @@ def tip(scene: dict[str, Any], tau: float, elements: int, seconds: float, densit
         shear_modulus=scene["shear"],
     )
     rod.shear_matrix[0, 0] = rod.shear_matrix[1, 1] = scene["shear"] * np.pi * radius**2
-    phi = helix["phase"] + (np.arange(elements) + 0.5) * length / elements / (helix["radius"] * np.tan(helix["angle"]))
+    phi = helix["phase"] + (np.arange(elements) + 0.5) * length / elements / (
+        helix["radius"] * np.tan(helix["angle"])
+    )
     places = helix["radius"] * np.stack([np.cos(phi), np.sin(phi), 0 * phi])
     step = 0.2 * length / elements / np.sqrt(scene["young"] / density)
     world = Scene()
     world.append(rod)
-    world.constrain(rod).using(ea.OneEndFixedBC, constrained_position_idx=(0,), constrained_director_idx=(0,))
+    world.constrain(rod).using(
+        ea.OneEndFixedBC, constrained_position_idx=(0,), constrained_director_idx=(0,)
+    )
     world.add_forcing_to(rod).using(Pull, -tau, places)
-    world.dampen(rod).using(ea.AnalyticalLinearDamper, uniform_damping_constant=damping, time_step=step)
+    world.dampen(rod).using(
+        ea.AnalyticalLinearDamper, uniform_damping_constant=damping, time_step=step
+    )
     world.finalize()
     ea.integrate(ea.PositionVerlet(), world, seconds, int(seconds / step), progress_bar=False)
     return rod.position_collection[:, -1].copy()

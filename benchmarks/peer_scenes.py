@@ -20,8 +20,8 @@ _B1: dict[str, Any] = {
 
 
 class Case(NamedTuple):
-    """A scene: what it is, its numbers; steps and order for vsr_jax; settings for SoRoMoX, from rough to fine; a tension and the tip
-    there by an independent program."""
+    """A scene: what it is, its numbers; steps and order for vsr_jax; settings for SoRoMoX, from
+    rough to fine; a tension and the tip there by an independent program."""
 
     about: str
     numbers: dict[str, Any]
@@ -58,9 +58,17 @@ CASES = {
         "B1 under gravity and a dead tip force",
         _B1 | {"gravity": (0.0, 0.0, -9.81), "tip_force": (0.0, 0.02, 0.02)},
         [(6, 6), (8, 6), (12, 6), (16, 6), (20, 6), (26, 6)],
-        [(6, 12, 1e-3), (8, 16, 1e-4), (12, 24, 1e-4), (16, 48, 1e-5), (20, 64, 1e-6), (24, 96, 1e-6)],
+        [
+            (6, 12, 1e-3),
+            (8, 16, 1e-4),
+            (12, 24, 1e-4),
+            (16, 48, 1e-5),
+            (20, 64, 1e-6),
+            (24, 96, 1e-6),
+        ],
         -5.0,
-        # by SciPy: cross-section balance by Newton, pose and moment by DOP853, base wrench by shooting with load steps
+        # by SciPy: cross-section balance by Newton, pose and moment by DOP853, base wrench by
+        # shooting with load steps
         (0.23267292337207685, 0.20950543772381253, -0.5284293230120489),
     ),
 }
@@ -72,5 +80,8 @@ def our_scene(numbers: dict[str, Any]) -> vsr.Scene:
     arm = vsr.Rod(numbers["length"], vsr.Circular(numbers["radius"]), material)
     loads: list[Any] = []
     if numbers["gravity"] is not None:
-        loads = [vsr.Gravity(numbers["gravity"]), vsr.TipWrench(force=numbers["tip_force"], frame="world")]
+        loads = [
+            vsr.Gravity(numbers["gravity"]),
+            vsr.TipWrench(force=numbers["tip_force"], frame="world"),
+        ]
     return vsr.Scene(arm, [vsr.Thread(vsr.Helix(**numbers["helix"]))], loads).astype("float64")

@@ -1,8 +1,10 @@
-"""SciPy's side of bench_peers: the continuous model by `scipy.integrate.solve_bvp`, as one writes it by hand.
+"""SciPy's side of bench_peers: the continuous model by `scipy.integrate.solve_bvp`, as one writes
+it by hand.
 
-State along the arm: position, unit quaternion, and in space the force and the moment in a section. The strain follows from the
-balance of each section by Newton's method. Clamped at the base, the given force at the tip, straight at the start; where that
-fails, the tension comes in five equal shares, each solution the start of the next.
+State along the arm: position, unit quaternion, and in space the force and the moment in a section.
+The strain follows from the balance of each section by Newton's method. Clamped at the base, the
+given force at the tip, straight at the start; where that fails, the tension comes in five equal
+shares, each solution the start of the next.
 """
 
 from typing import Any
@@ -19,13 +21,25 @@ class Arm:
         second = area * scene["radius"] ** 2 / 4
         self.length, self.helix = scene["length"], scene["helix"]
         shear, young = scene["shear"], scene["young"]
-        self.stiffness = np.array([2 * shear * second, young * second, young * second, young * area, shear * area, shear * area])
+        self.stiffness = np.array(
+            [
+                2 * shear * second,
+                young * second,
+                young * second,
+                young * area,
+                shear * area,
+                shear * area,
+            ]
+        )
         self.weight = scene["density"] * area * np.array(scene["gravity"] or (0.0, 0.0, 0.0))
         self.tip_force = np.array(scene["tip_force"] or (0.0, 0.0, 0.0))
 
     def thread(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where the thread crosses the sections, and its slope, shape (n, 3)."""
-        radius, rate = self.helix["radius"], 1 / (self.helix["radius"] * np.tan(self.helix["angle"]))
+        radius, rate = (
+            self.helix["radius"],
+            1 / (self.helix["radius"] * np.tan(self.helix["angle"])),
+        )
         phi = self.helix["phase"] + rate * X
         zero = np.zeros_like(X)
         place = radius * np.stack([zero, np.cos(phi), np.sin(phi)], 1)
@@ -43,7 +57,9 @@ class Arm:
             t = t / size
             r = self.stiffness * (xi - rest) - tau * np.einsum("nji,nj->ni", P, t) - reaction
             W = (tau / size)[:, :, None] * (np.eye(3) - t[:, :, None] * t[:, None, :])
-            step = np.linalg.solve(np.diag(self.stiffness) - np.einsum("nji,njk,nkl->nil", P, W, P), r[..., None])[..., 0]
+            step = np.linalg.solve(
+                np.diag(self.stiffness) - np.einsum("nji,njk,nkl->nil", P, W, P), r[..., None]
+            )[..., 0]
             xi -= step
             if np.max(np.abs(step)) < 1e-12:
                 break
@@ -51,12 +67,24 @@ class Arm:
 
     def slope(self, X: np.ndarray, y: np.ndarray, tau: float) -> np.ndarray:
         """Derivative of the state."""
-        quaternion, force, moment = y[3:7].T / np.linalg.norm(y[3:7], axis=0)[:, None], y[7:10].T, y[10:].T
+        quaternion, force, moment = (
+            y[3:7].T / np.linalg.norm(y[3:7], axis=0)[:, None],
+            y[7:10].T,
+            y[10:].T,
+        )
         R = _rotation(quaternion)
-        xi = self.strain(X, np.concatenate([np.einsum("nji,nj->ni", R, moment), np.einsum("nji,nj->ni", R, force)], 1), tau)
+        xi = self.strain(
+            X,
+            np.concatenate(
+                [np.einsum("nji,nj->ni", R, moment), np.einsum("nji,nj->ni", R, force)], 1
+            ),
+            tau,
+        )
         tangent = np.einsum("nij,nj->ni", R, xi[:, 3:])
         w, v, k = quaternion[:, :1], quaternion[:, 1:], xi[:, :3]
-        turning = 0.5 * np.concatenate([-np.sum(v * k, 1, keepdims=True), w * k + np.cross(v, k)], 1)
+        turning = 0.5 * np.concatenate(
+            [-np.sum(v * k, 1, keepdims=True), w * k + np.cross(v, k)], 1
+        )
         weight = np.broadcast_to(-self.weight, tangent.shape)
         return np.concatenate([tangent, turning, weight, -np.cross(tangent, force)], 1).T
 
@@ -68,7 +96,12 @@ class Arm:
         start[7:10] = self.tip_force[:, None]
         solution = self._solved(X, start, tau, tol)
         for share in () if solution.success else np.linspace(0.2, 1, 5):
-            solution = self._solved(solution.x if share > 0.2 else X, solution.y if share > 0.2 else start, share * tau, tol)
+            solution = self._solved(
+                solution.x if share > 0.2 else X,
+                solution.y if share > 0.2 else start,
+                share * tau,
+                tol,
+            )
         return solution.y[:3, -1] if solution.success else np.full(3, np.nan)
 
     def _solved(self, X: np.ndarray, start: np.ndarray, tau: float, tol: float) -> Any:
@@ -77,13 +110,17 @@ class Arm:
         def ends(y0: np.ndarray, yL: np.ndarray) -> np.ndarray:
             return np.concatenate([y0[:7] - base, yL[7:10] - self.tip_force, yL[10:]])
 
-        return solve_bvp(lambda X, y: self.slope(X, y, tau), ends, X, start, tol=tol, max_nodes=20_000)
+        return solve_bvp(
+            lambda X, y: self.slope(X, y, tau), ends, X, start, tol=tol, max_nodes=20_000
+        )
 
 
 def _skew(v: np.ndarray) -> np.ndarray:
     zero = np.zeros(len(v))
     x, y, z = v.T
-    return np.stack([np.stack([zero, -z, y], 1), np.stack([z, zero, -x], 1), np.stack([-y, x, zero], 1)], 1)
+    return np.stack(
+        [np.stack([zero, -z, y], 1), np.stack([z, zero, -x], 1), np.stack([-y, x, zero], 1)], 1
+    )
 
 
 def _rotation(q: np.ndarray) -> np.ndarray:

@@ -1,19 +1,23 @@
-"""SoRoMoX's side of bench_peers: an arm as the minimum of an energy put together from SoRoMoX's own functions.
+"""SoRoMoX's side of bench_peers: an arm as the minimum of an energy put together from SoRoMoX's own
+functions.
 
-SoRoMoX (0.5) has no static solver. Its authors' scripts solve K q + G(q) = A(q) u by Newton's method from q = 0; that is one of the
-rows for arms without loads, and diverges on the loaded arm B1, which is far softer than its loads. `FORMULATIONS` keeps what else
-was tried. The fastest by far, and the one used:
+SoRoMoX (0.5) has no static solver. Its authors' scripts solve K q + G(q) = A(q) u by Newton's
+method from q = 0; that is one of the rows for arms without loads, and diverges on the loaded arm
+B1, which is far softer than its loads. `FORMULATIONS` keeps what else was tried. The fastest by
+far, and the one used:
 
-- one energy in place of the assembled forces: elastic energy, plus tension times path length, minus the work of the loads. Its
-  reverse-mode gradient costs about three runs of the kinematics, the forces a recurrence of Jacobians;
-- coordinates whitened by the Cholesky factor of SoRoMoX's stiffness matrix, in which BFGS with steps of length one is there
-  after 10 to 15 gradients, without a Hessian or load steps;
-- kinematics with all cells side by side and only the product of their steps in a scan (`cells`). SoRoMoX's own does it all
-  cell after cell and takes up to twice as long.
+- one energy in place of the assembled forces: elastic energy, plus tension times path length, minus
+  the work of the loads. Its reverse-mode gradient costs about three runs of the kinematics, the
+  forces a recurrence of Jacobians;
+- coordinates whitened by the Cholesky factor of SoRoMoX's stiffness matrix, in which BFGS with
+  steps of length one is there after 10 to 15 gradients, without a Hessian or load steps;
+- kinematics with all cells side by side and only the product of their steps in a scan (`cells`).
+  SoRoMoX's own does it all cell after cell and takes up to twice as long.
 
-Conventions, read in its sources and confirmed by its tip, which converges to the reference: strains angular first, rod along x, strain
-on the right of the pose, base pose as quaternion (x, y, z, w) and position, "horizontal" being the identity (its default is
-"upright"); a tendon's input is its tension >= 0 and its coordinate minus the length of its path.
+Conventions, read in its sources and confirmed by its tip, which converges to the reference: strains
+angular first, rod along x, strain on the right of the pose, base pose as quaternion (x, y, z, w)
+and position, "horizontal" being the identity (its default is "upright"); a tendon's input is its
+tension >= 0 and its coordinate minus the length of its path.
 """
 
 from collections.abc import Callable
@@ -37,8 +41,9 @@ BFGS = "energy, BFGS, cells side by side (used)"
 
 
 class Setting(NamedTuple):
-    """Order of the basis of all six strains, Gauss points along the arm, the step, in whitened coordinates, that ends the iteration,
-    the family of the basis, and how the balance is found: a key of `FORMULATIONS`."""
+    """Order of the basis of all six strains, Gauss points along the arm, the step, in whitened
+    coordinates, that ends the iteration, the family of the basis, and how the balance is found: a
+    key of `FORMULATIONS`."""
 
     order: int
     points: int
@@ -73,8 +78,8 @@ class HelixPath(BaseThreadlikeRoutingParams):
 
 
 class Arm(NamedTuple):
-    """A robot of SoRoMoX, the force on its tip [N], None for an arm without loads, and the matrix from whitened coordinates to
-    the robot's own."""
+    """A robot of SoRoMoX, the force on its tip [N], None for an arm without loads, and the matrix
+    from whitened coordinates to the robot's own."""
 
     robot: Any
     force: Array | None
@@ -94,7 +99,9 @@ def offset_slope(path: HelixPath, s: Array) -> Array:
 
 def tendon(path: HelixPath) -> ThreadlikeActuator:
     """The path driven as a tendon."""
-    return ThreadlikeActuator.tendons(ThreadlikeRouting(params=path, offset_fn=offset, derivative_fn=offset_slope))
+    return ThreadlikeActuator.tendons(
+        ThreadlikeRouting(params=path, offset_fn=offset, derivative_fn=offset_slope)
+    )
 
 
 def build(setting: Setting, scene: dict[str, Any]) -> tuple[Arm, HelixPath]:
@@ -109,12 +116,18 @@ def build(setting: Setting, scene: dict[str, Any]) -> tuple[Arm, HelixPath]:
         shear_modulus=scene["shear"],
     )
     basis = StrainBasisSpec(type=setting.family, strain_selector=[1] * 6, basis_order=setting.order)
-    segment = GVSSegment(link=link, joint=JointSpec(type="fixed"), basis=basis, num_gauss_points=setting.points)
+    segment = GVSSegment(
+        link=link, joint=JointSpec(type="fixed"), basis=basis, num_gauss_points=setting.points
+    )
     mounting = spatial_mounting_pose("horizontal")
     gravity = jnp.array(scene["gravity"] or (0.0, 0.0, 0.0))
-    robot = GVS.from_segments([segment], gravity=gravity, base_pose=mounting, actuators=tendon(path))
+    robot = GVS.from_segments(
+        [segment], gravity=gravity, base_pose=mounting, actuators=tendon(path)
+    )
     whiten = jnp.linalg.inv(jnp.linalg.cholesky(robot.stiffness_matrix())).T
-    return Arm(robot, None if scene["tip_force"] is None else jnp.array(scene["tip_force"]), whiten), path
+    return Arm(
+        robot, None if scene["tip_force"] is None else jnp.array(scene["tip_force"]), whiten
+    ), path
 
 
 def own_kinematics(robot: Any, q: Array) -> Array:
@@ -123,7 +136,8 @@ def own_kinematics(robot: Any, q: Array) -> Array:
 
 
 def cells(robot: Any, q: Array) -> Array:
-    """The same poses with the cells side by side: SoRoMoX's bases, two-point Magnus step and exponential."""
+    """The same poses with the cells side by side: SoRoMoX's bases, two-point Magnus step and
+    exponential."""
     q = robot._min_size_gathered(q)[0, 1]
     width = robot.segment_lengths[0] * robot.cell_widths[0][:, None]
     lower, upper = robot.B_Z1[0] @ q + robot.xi_ref_Z1[0], robot.B_Z2[0] @ q + robot.xi_ref_Z2[0]
@@ -138,8 +152,11 @@ def tip(arm: Arm, z: Array) -> Array:
     return cells(arm.robot, arm.whiten @ z)[-1, :3, 3]
 
 
-def energy(arm: Arm, path: HelixPath, tau: Array, z: Array, share: Any = 1.0, kinematics: Callable = cells) -> Array:
-    """Energy [J] at whitened coordinates z under the signed thread force tau [N], shape (1,), and a share of the loads."""
+def energy(
+    arm: Arm, path: HelixPath, tau: Array, z: Array, share: Any = 1.0, kinematics: Callable = cells
+) -> Array:
+    """Energy [J] at whitened coordinates z under the signed thread force tau [N], shape (1,), and a
+    share of the loads."""
     robot, q = arm.robot, arm.whiten @ z
     own = robot.elastic_energy(q) + tau @ tendon(path).coordinates(robot, q)
     if arm.force is None:
@@ -155,18 +172,24 @@ def slope(arm: Arm, path: HelixPath, tau: Array, z: Array, share: Any = 1.0) -> 
 
 
 def minimise(value_and_grad: Callable, z: Array, tolerance: float, max_steps: int = 60) -> Array:
-    """BFGS from z with steps of length one, halved while the energy does not fall, until a step is shorter than the tolerance."""
+    """BFGS from z with steps of length one, halved while the energy does not fall, until a step is
+    shorter than the tolerance."""
 
     def step(state: tuple) -> tuple:
         z, value, slope, inverse, length, _, count = state
-        move = -length * (inverse @ slope)  # none in the first pass, which fetches value and slope at the start
+        move = -length * (
+            inverse @ slope
+        )  # none in the first pass, which fetches value and slope at the start
         new_value, new_slope = value_and_grad(z + move)
         change = new_slope - slope
         curvature, image = move @ change, inverse @ change
         weighted = (1 + change @ image / curvature) * move - image
         update = (jnp.outer(weighted, move) - jnp.outer(move, image)) / curvature
         fell = new_value <= value + 1e-4 * (move @ slope) + 1e-15
-        z, value, slope = (jnp.where(fell, new, old) for new, old in ((z + move, z), (new_value, value), (new_slope, slope)))
+        z, value, slope = (
+            jnp.where(fell, new, old)
+            for new, old in ((z + move, z), (new_value, value), (new_slope, slope))
+        )
         inverse = jnp.where(curvature > 0, inverse + update, inverse)
         moved = jnp.where(fell & (count > 0), jnp.linalg.norm(move), jnp.inf)
         return z, value, slope, inverse, jnp.where(fell, 1.0, length / 2), moved, count + 1
@@ -174,18 +197,35 @@ def minimise(value_and_grad: Callable, z: Array, tolerance: float, max_steps: in
     def unfinished(state: tuple) -> Array:
         return (state[5] > tolerance) & (state[6] < max_steps)
 
-    start = (z, jnp.array(jnp.inf), jnp.zeros_like(z), jnp.eye(len(z)), jnp.array(1.0), jnp.array(jnp.inf), 0)
+    start = (
+        z,
+        jnp.array(jnp.inf),
+        jnp.zeros_like(z),
+        jnp.eye(len(z)),
+        jnp.array(1.0),
+        jnp.array(jnp.inf),
+        0,
+    )
     return jax.lax.while_loop(unfinished, step, start)[0]
 
 
-def equilibrium(arm: Arm, path: HelixPath, tau: Array, tolerance: float, kinematics: Callable = cells) -> Array:
+def equilibrium(
+    arm: Arm, path: HelixPath, tau: Array, tolerance: float, kinematics: Callable = cells
+) -> Array:
     """Whitened coordinates of the equilibrium, found from rest."""
     evaluate = jax.value_and_grad(energy, argnums=3)
-    return minimise(lambda z: evaluate(arm, path, tau, z, 1.0, kinematics), jnp.zeros(len(arm.whiten)), tolerance)
+    return minimise(
+        lambda z: evaluate(arm, path, tau, z, 1.0, kinematics),
+        jnp.zeros(len(arm.whiten)),
+        tolerance,
+    )
 
 
-def height_gradient(arm: Arm, path: HelixPath, tau: Array, tolerance: float, solve: Callable = equilibrium) -> HelixPath:
-    """Derivative of the tip's height by the path's numbers: implicit, the adjoint by conjugate gradients on Hessian products."""
+def height_gradient(
+    arm: Arm, path: HelixPath, tau: Array, tolerance: float, solve: Callable = equilibrium
+) -> HelixPath:
+    """Derivative of the tip's height by the path's numbers: implicit, the adjoint by conjugate
+    gradients on Hessian products."""
     z = solve(arm, path, tau, tolerance)
     right = jax.grad(lambda z: tip(arm, z)[2])(z)
     _, hessian = jax.linearize(partial(slope, arm, path, tau), z)
@@ -194,14 +234,16 @@ def height_gradient(arm: Arm, path: HelixPath, tau: Array, tolerance: float, sol
 
 
 def _forces(arm: Arm, path: HelixPath, tau: Array, z: Array, share: Any) -> Array:
-    """The residual as SoRoMoX's authors write it, with the tip force by the Jacobian: K q - A(q) u + share (G(q) - J^T f)."""
+    """The residual as SoRoMoX's authors write it, with the tip force by the Jacobian: K q - A(q) u
+    + share (G(q) - J^T f)."""
     robot, q = arm.robot, arm.whiten @ z
     loads = robot.gravitational_force(q) - robot.jacobian_tips(q)[-1, 3:].T @ arm.force
     return arm.whiten.T @ (robot.elastic_force(q) - robot.actuation_force(q, -tau) + share * loads)
 
 
 def _newton(residual: Callable, arm: Arm, path: HelixPath, tau: Array, tolerance: float) -> Array:
-    """Newton's method by `jax.jacfwd`: one step at each of eight shares of the loads, then four at the whole."""
+    """Newton's method by `jax.jacfwd`: one step at each of eight shares of the loads, then four at
+    the whole."""
 
     def step(z: Array, share: Array) -> tuple[Array, None]:
         at = partial(residual, arm, path, tau, share=share)
@@ -214,11 +256,16 @@ def _newton(residual: Callable, arm: Arm, path: HelixPath, tau: Array, tolerance
 def _optimistix(arm: Arm, path: HelixPath, tau: Array, tolerance: float) -> Array:
     solver = optimistix.BFGS(rtol=tolerance / 10, atol=tolerance / 10)
     rest = jnp.zeros(len(arm.whiten))
-    return optimistix.minimise(lambda z, _: energy(arm, path, tau, z), solver, rest, max_steps=100, throw=False).value
+    return optimistix.minimise(
+        lambda z, _: energy(arm, path, tau, z), solver, rest, max_steps=100, throw=False
+    ).value
 
 
-def _newton_from_rest(arm: Arm, path: HelixPath, tau: Array, tolerance: float, max_steps: int = 30) -> Array:
-    """K q = A(q) u as SoRoMoX's authors write it, by Newton's method until a step is shorter than the tolerance; no loads."""
+def _newton_from_rest(
+    arm: Arm, path: HelixPath, tau: Array, tolerance: float, max_steps: int = 30
+) -> Array:
+    """K q = A(q) u as SoRoMoX's authors write it, by Newton's method until a step is shorter than
+    the tolerance; no loads."""
 
     def residual(z: Array) -> Array:
         q = arm.whiten @ z
@@ -230,7 +277,9 @@ def _newton_from_rest(arm: Arm, path: HelixPath, tau: Array, tolerance: float, m
         return z - move, jnp.linalg.norm(move), count + 1
 
     start = jnp.zeros(len(arm.whiten)), jnp.array(jnp.inf), 0
-    return jax.lax.while_loop(lambda state: (state[1] > tolerance) & (state[2] < max_steps), step, start)[0]
+    return jax.lax.while_loop(
+        lambda state: (state[1] > tolerance) & (state[2] < max_steps), step, start
+    )[0]
 
 
 FORMULATIONS: dict[str, Callable] = {

@@ -1,12 +1,16 @@
-"""Margin and convergence of one arm over a plane of tension and pressure, and what SoRoMoX makes of the same inputs.
+"""Margin and convergence of one arm over a plane of tension and pressure, and what SoRoMoX makes of
+the same inputs.
 
-A stout silicone arm with a tendon that comes in towards the axis and a chamber opposite. Run it, after `pip install ".[bench]"`, with
+A stout silicone arm with a tendon that comes in towards the axis and a chamber opposite. Run it,
+after `pip install ".[bench]"`, with
 
-    python benchmarks/plane.py --plot benchmarks/results/plane.png --json benchmarks/results/plane.json
+    python benchmarks/plane.py --plot benchmarks/results/plane.png
+        --json benchmarks/results/plane.json
 
-SoRoMoX (0.5) has no static solver: its side is its authors' way, Newton's method from rest on its own forces, K q = A(q) u, with
-Legendre polynomials of order 6 for all six strains. A shape counts as right within one per cent of the length of the tip of our
-solve with 96 steps, which is exact in the strain; both sides are float64.
+SoRoMoX (0.5) has no static solver: its side is its authors' way, Newton's method from rest on its
+own forces, K q = A(q) u, with Legendre polynomials of order 6 for all six strains. A shape counts
+as right within one per cent of the length of the tip of our solve with 96 steps, which is exact in
+the strain; both sides are float64.
 """
 
 import argparse
@@ -31,7 +35,12 @@ TENDON, CHAMBER = (0.008, -0.05), (-0.008, 0.0)
 """Where tendon and chamber start [m] and by how much they come nearer to the axis [m/m]."""
 MOST_TENSION, MOST_PRESSURE = 220.0, 12e5
 SAME = 0.01
-RIGHT, SILENT, UNSAID, DIVERGED = "right", "wrong shape", "a shape where none is stable", "residual left, or NaN"
+RIGHT, SILENT, UNSAID, DIVERGED = (
+    "right",
+    "wrong shape",
+    "a shape where none is stable",
+    "residual left, or NaN",
+)
 
 
 def planes(size: int) -> tuple[np.ndarray, np.ndarray]:
@@ -43,7 +52,10 @@ def ours(inputs: np.ndarray) -> tuple[np.ndarray, ...]:
     """Status, margin and tip [m] for tension and pressure, shape (n, 2)."""
     material = vsr.Material(YOUNG, poisson=POISSON)
     paths = [vsr.Linear(y=0.0, z=z, slope_y=0.0, slope_z=slope) for z, slope in (TENDON, CHAMBER)]
-    scene = vsr.Scene(vsr.Rod(LENGTH, vsr.Circular(RADIUS), material), [vsr.Tendon(paths[0]), vsr.Chamber(paths[1], area=AREA)])
+    scene = vsr.Scene(
+        vsr.Rod(LENGTH, vsr.Circular(RADIUS), material),
+        [vsr.Tendon(paths[0]), vsr.Chamber(paths[1], area=AREA)],
+    )
 
     def at(inputs: jax.Array) -> tuple:
         eq = vsr.solve(scene, inputs, model=vsr.StrainDependent(96))
@@ -53,7 +65,8 @@ def ours(inputs: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def soromox(inputs: np.ndarray, order: int = 6, points: int = 40) -> tuple[np.ndarray, ...]:
-    """Residual without unit and tip [m] where SoRoMoX's own forces are solved by Newton's method from rest."""
+    """Residual without unit and tip [m] where SoRoMoX's own forces are solved by Newton's method
+    from rest."""
     from soromox.actuation import ThreadlikeActuator, ThreadlikeRouting  # pyright: ignore[reportMissingImports]
     from soromox.systems.components import JointSpec, LinkSpec  # pyright: ignore[reportMissingImports]
     from soromox.systems.gvs import GVS, GVSSegment, StrainBasisSpec  # pyright: ignore[reportMissingImports]
@@ -62,14 +75,25 @@ def soromox(inputs: np.ndarray, order: int = 6, points: int = 40) -> tuple[np.nd
     shear = YOUNG / (2 * (1 + POISSON))
     straight = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0]
     link = LinkSpec.circular(
-        length=LENGTH, radius=RADIUS, density=1000.0, reference_strain=straight, young_modulus=YOUNG, shear_modulus=shear
+        length=LENGTH,
+        radius=RADIUS,
+        density=1000.0,
+        reference_strain=straight,
+        young_modulus=YOUNG,
+        shear_modulus=shear,
     )
     basis = StrainBasisSpec(type="legendre", strain_selector=[1] * 6, basis_order=order)
-    segment = GVSSegment(link=link, joint=JointSpec(type="fixed"), basis=basis, num_gauss_points=points)
-    starts, slopes = (jnp.array([[0.0, 0.0, path[i]] for path in (TENDON, CHAMBER)]) for i in (0, 1))
+    segment = GVSSegment(
+        link=link, joint=JointSpec(type="fixed"), basis=basis, num_gauss_points=points
+    )
+    starts, slopes = (
+        jnp.array([[0.0, 0.0, path[i]] for path in (TENDON, CHAMBER)]) for i in (0, 1)
+    )
     tendons = ThreadlikeActuator.tendons(ThreadlikeRouting.linear(intercept=starts, slope=slopes))
     mounting = spatial_mounting_pose("horizontal")
-    robot = GVS.from_segments([segment], gravity=jnp.zeros(3), base_pose=mounting, actuators=tendons)
+    robot = GVS.from_segments(
+        [segment], gravity=jnp.zeros(3), base_pose=mounting, actuators=tendons
+    )
     K = robot.stiffness_matrix()
 
     def at(inputs: jax.Array) -> tuple:
@@ -86,10 +110,14 @@ def soromox(inputs: np.ndarray, order: int = 6, points: int = 40) -> tuple[np.nd
         left = jnp.sqrt(r @ jnp.linalg.solve(K, r) / (YOUNG * jnp.pi * RADIUS**2 * LENGTH))
         return left, robot._forward_kinematics_gauss(robot._min_size_gathered(q))[0, -1, :3, 3]
 
-    return tuple(np.asarray(x) for x in jax.lax.map(jax.jit(at), jnp.asarray(inputs), batch_size=64))
+    return tuple(
+        np.asarray(x) for x in jax.lax.map(jax.jit(at), jnp.asarray(inputs), batch_size=64)
+    )
 
 
-def verdicts(status: np.ndarray, tip: np.ndarray, left: np.ndarray, other: np.ndarray) -> np.ndarray:
+def verdicts(
+    status: np.ndarray, tip: np.ndarray, left: np.ndarray, other: np.ndarray
+) -> np.ndarray:
     """What SoRoMoX's answers are, given ours."""
     converged = left < 1e-6
     same = np.linalg.norm(tip - other, axis=-1) < SAME * LENGTH
@@ -102,11 +130,13 @@ FAILED = {
     vsr.Status.COLLAPSED: "#f0e442",
     vsr.Status.UNSTABLE: "#009e73",
     vsr.Status.UNDER_RESOLVED: "#e69f00",
-    vsr.Status.MAX_STEPS: "#000000",
+    vsr.Status.NOT_CONVERGED: "#000000",
 }
 
 
-def draw(path: str, size: int, status: np.ndarray, margin: np.ndarray, said: np.ndarray | None) -> None:
+def draw(
+    path: str, size: int, status: np.ndarray, margin: np.ndarray, said: np.ndarray | None
+) -> None:
     """The two planes side by side."""
     tensions, pressures = planes(size)
     pressures = pressures / 1e5
@@ -116,25 +146,41 @@ def draw(path: str, size: int, status: np.ndarray, margin: np.ndarray, said: np.
     def cells(ax: Axes, labels: np.ndarray, colours: dict) -> None:
         for label, colour in colours.items():
             mine = np.ma.masked_where(labels.reshape(size, size) != label, np.ones((size, size)))
-            ax.pcolormesh(tensions, pressures, mine, cmap=ListedColormap([colour]), shading="nearest")
+            ax.pcolormesh(
+                tensions, pressures, mine, cmap=ListedColormap([colour]), shading="nearest"
+            )
 
     def below(ax: Axes, names: list[Patch]) -> None:
         ax.legend(
-            handles=names, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=1 if len(names) > 2 else 2, frameon=False
+            handles=names,
+            loc="upper center",
+            bbox_to_anchor=(0.5, -0.12),
+            ncols=1 if len(names) > 2 else 2,
+            frameon=False,
         ).set_in_layout(False)
 
     cells(axes[0], status, FAILED)
     shown = np.where(status == vsr.Status.CONVERGED, margin, np.nan).reshape(size, size)
-    image = axes[0].pcolormesh(tensions, pressures, shown, cmap="Blues_r", vmin=0, vmax=1, shading="nearest")
+    image = axes[0].pcolormesh(
+        tensions, pressures, shown, cmap="Blues_r", vmin=0, vmax=1, shading="nearest"
+    )
     figure.colorbar(image, ax=axes[0], label="margin of stability")
     axes[0].contour(tensions, pressures, shown, levels=[0.1, 0.3], colors="white", linewidths=0.8)
-    names = [Patch(color=colour, label=key.name.lower().replace("_", " ")) for key, colour in FAILED.items() if np.any(status == key)]
+    names = [
+        Patch(color=colour, label=key.name.lower().replace("_", " "))
+        for key, colour in FAILED.items()
+        if np.any(status == key)
+    ]
     below(axes[0], names)
     axes[0].set(title="vsr_jax", xlabel="tension [N]", ylabel="pressure [bar]")
     if said is not None:
         cells(axes[1], said, COLOURS)
         shares = {key: np.mean(said == key) for key in COLOURS}
-        names = [Patch(color=COLOURS[key], label=f"{key}: {share:.0%}") for key, share in shares.items() if share > 0]
+        names = [
+            Patch(color=COLOURS[key], label=f"{key}: {share:.0%}")
+            for key, share in shares.items()
+            if share > 0
+        ]
         below(axes[1], names)
     axes[1].set(title="SoRoMoX 0.5, Newton from rest", xlabel="tension [N]")
     figure.savefig(path, dpi=150)
@@ -142,7 +188,9 @@ def draw(path: str, size: int, status: np.ndarray, margin: np.ndarray, said: np.
 
 def main() -> None:
     """Both sides on the same inputs; counts, JSON and the figure."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--size", type=int, default=41, help="points a side (default: %(default)s)")
     parser.add_argument("--plot", metavar="FILE")
     parser.add_argument("--json", metavar="FILE")

@@ -2,8 +2,8 @@
 
     pip install ".[notebooks]" && python benchmarks/run_notebooks.py [01_first_arm ...]
 
-They run in notebooks/ and are left as they are: what they put out goes to a temporary folder. Ends with 1 at the first that fails, after
-its name and the last line of its error.
+They run in notebooks/ and are left as they are: what they put out goes to a temporary folder. Ends
+with 1 at the first that fails, after its name and the last line of its error.
 """
 
 import argparse
@@ -30,8 +30,23 @@ def chosen(names: list[str]) -> list[Path]:
 def run(path: Path, timeout: int) -> str | None:
     """The last line of the error, None where there is none."""
     with tempfile.TemporaryDirectory() as out:
-        settings = [f"--ExecutePreprocessor.timeout={timeout}", "--output-dir", out, "--log-level", "ERROR"]
-        command = [sys.executable, "-m", "nbconvert", "--to", "notebook", "--execute", *settings, path.name]
+        settings = [
+            f"--ExecutePreprocessor.timeout={timeout}",
+            "--output-dir",
+            out,
+            "--log-level",
+            "ERROR",
+        ]
+        command = [
+            sys.executable,
+            "-m",
+            "nbconvert",
+            "--to",
+            "notebook",
+            "--execute",
+            *settings,
+            path.name,
+        ]
         done = subprocess.run(command, cwd=FOLDER, capture_output=True, text=True, check=False)
     if done.returncode == 0:
         return None
@@ -40,9 +55,15 @@ def run(path: Path, timeout: int) -> str | None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("notebooks", nargs="*", metavar="NOTEBOOK", help="names of single notebooks, all by default")
-    parser.add_argument("--timeout", type=int, default=600, metavar="SECONDS", help="for one cell (600)")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "notebooks", nargs="*", metavar="NOTEBOOK", help="names of single notebooks, all by default"
+    )
+    parser.add_argument(
+        "--timeout", type=int, default=600, metavar="SECONDS", help="for one cell (600)"
+    )
     options = parser.parse_args()
     for path in chosen(options.notebooks):
         start = time.perf_counter()

@@ -1,12 +1,16 @@
-"""Shared by all tests: double precision on, shapes checked at run time, tolerances by precision, and the paper's helix.
+"""Shared by all tests: double precision on, shapes checked at run time, tolerances by precision,
+and the paper's helix.
 
-Nearly all of the suite's time is XLA's compiler, and each program runs only a few times on little data: so it is told not to
-optimise, which makes it two to three times faster. Set XLA_FLAGS yourself (to nothing, say) to test what users run.
+Nearly all of the suite's time is XLA's compiler, and each program runs only a few times on little
+data: so it is told not to optimise, which makes it two to three times faster. Set XLA_FLAGS
+yourself (to nothing, say) to test what users run.
 """
 
 import os
 
-os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0")
+os.environ.setdefault(
+    "XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
+)
 
 import jaxtyping
 
@@ -20,7 +24,7 @@ import pytest
 
 jax.config.update("jax_enable_x64", True)
 
-from vsr_jax import paper  # noqa: E402
+from vsr_jax.studies import paper  # noqa: E402
 
 
 def epsilon(dtype) -> float:
@@ -29,10 +33,13 @@ def epsilon(dtype) -> float:
 
 
 def central_differences(function, size):
-    """Derivative at zero of a function of a vector of `size` numbers, by steps of one, of fourth order."""
+    """Derivative at zero of a function of a vector of `size` numbers, by steps of one, of fourth
+    order."""
 
     def change(unit):
-        return (8 * (function(unit) - function(-unit)) - (function(2 * unit) - function(-2 * unit))) / 12
+        return (
+            8 * (function(unit) - function(-unit)) - (function(2 * unit) - function(-2 * unit))
+        ) / 12
 
     return np.stack([change(unit) for unit in np.eye(size)])
 
@@ -50,7 +57,8 @@ def helix():
 
 @pytest.fixture
 def unchecked():
-    """What a user meets: without the run-time type checks of the tests, bad arguments reach the package's own checks."""
+    """What a user meets: without the run-time type checks of the tests, bad arguments reach the
+    package's own checks."""
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)

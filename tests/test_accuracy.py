@@ -1,4 +1,5 @@
-"""The study of what accuracy costs: its errors against the reference solutions and against differences of finer solves."""
+"""The study of what accuracy costs: its errors against the reference solutions and against
+differences of finer solves."""
 
 import json
 
@@ -9,8 +10,9 @@ import numpy as np
 import pytest
 
 import vsr_jax as vsr
-from vsr_jax import accuracy, accuracy_figures, cli, cli_common, cli_studies, paper
-from vsr_jax.plan import gradient_error
+from vsr_jax.cli import common as cli_common, main as cli, study_commands as cli_studies
+from vsr_jax.solution.step_choice import gradient_error
+from vsr_jax.studies import accuracy, accuracy_figures, paper
 
 WAYS = [accuracy.Setting("steps of order 6", "8", vsr.StrainDependent(8))]
 INPUTS = jnp.array([[-15.0], [-5.0]])
@@ -26,7 +28,8 @@ def test_tip_error_against_the_independent_reference(rows):
     entries = {float(entry.tau[0]): entry for entry in paper.reference("B1")}
     true = [
         np.linalg.norm(
-            np.asarray(vsr.solve(paper.scene("B1"), u, model=vsr.StrainDependent(8)).tip)[:3, 3] - entries[float(u[0])].tip[:3, 3]
+            np.asarray(vsr.solve(paper.scene("B1"), u, model=vsr.StrainDependent(8)).tip)[:3, 3]
+            - entries[float(u[0])].tip[:3, 3]
         )
         for u in INPUTS
         if float(u[0]) in entries
@@ -47,7 +50,10 @@ def test_gradient_error_against_central_differences_at_ten_times_the_steps(rows)
     ends = np.cumsum([leaf.size for leaf in leaves])[:-1]
 
     def tip(values, steps):
-        parts = [part.reshape(leaf.shape) for part, leaf in zip(jnp.split(values, ends), leaves, strict=True)]
+        parts = [
+            part.reshape(leaf.shape)
+            for part, leaf in zip(jnp.split(values, ends), leaves, strict=True)
+        ]
         scene, inputs = eqx.combine(jax.tree.unflatten(tree, parts), rest)
         return vsr.solve(scene, inputs, model=vsr.StrainDependent(steps)).tip[:3, 3]
 
@@ -68,7 +74,9 @@ def test_words_and_table(rows):
 
 
 def test_figure(rows):
-    figure = accuracy_figures.work_precision({"B1": rows}, others={"B1": {"another": ([10.0], [1e-3])}})
+    figure = accuracy_figures.work_precision(
+        {"B1": rows}, others={"B1": {"another": ([10.0], [1e-3])}}
+    )
     assert figure.axes[0].get_title() == "B1"
     assert len(figure.axes[0].lines) == 3
     with pytest.raises(ValueError, match="error: got 'shape', need one of"):
@@ -77,14 +85,22 @@ def test_figure(rows):
 
 def test_settings_span_the_models():
     found = accuracy.settings(paper.scene("B1"), own=paper.basis("B1"))
-    assert {type(way.model) for way in found} == {vsr.StrainDependent, vsr.Prescribed, vsr.Continuum}
+    assert {type(way.model) for way in found} == {
+        vsr.StrainDependent,
+        vsr.Prescribed,
+        vsr.Continuum,
+    }
     assert cli_studies._GROUPS == accuracy.GROUPS
 
 
 def test_the_command(tmp_path, capsys, monkeypatch, rows):
     def measure(scene, inputs, ways, say):
         assert inputs.shape == (2, 2)
-        assert {way.family for way in ways} == {"steps of order 2", "steps of order 4", "steps of order 6"}
+        assert {way.family for way in ways} == {
+            "steps of order 2",
+            "steps of order 4",
+            "steps of order 6",
+        }
         return rows
 
     monkeypatch.setattr(accuracy, "measure", measure)
@@ -94,7 +110,7 @@ def test_the_command(tmp_path, capsys, monkeypatch, rows):
         "--inputs",
         "-5",
         "-5",
-        "--lanes",
+        "--batch-size",
         "2",
         "--groups",
         "steps",

@@ -36,7 +36,8 @@ def test_lengths_give_back_the_tensions(pulled):
 
 
 def test_prescribed_lengths_are_slack_or_taut(pulled):
-    """On both sides of the switch: the second cable is let out to 1 um short of, and 1 um past, where it goes slack."""
+    """On both sides of the switch: the second cable is let out to 1 um short of, and 1 um past,
+    where it goes slack."""
     driven = scene(control="length")
     model = vsr.Prescribed(vsr.Basis.uniform(vsr.Legendre(3)), steps=8)
     alone = vsr.solve(scene(), jnp.array([3.0, 0.0]), model=model)
@@ -60,7 +61,8 @@ def test_strain_dependent_slack_is_the_tendon_left_out(pulled):
 
 
 def test_elastic_cable_gives_way(pulled):
-    """The cable's stretch makes up for the stretch that the tension needs: T = k (l / c - 1) at the solution."""
+    """The cable's stretch makes up for the stretch that the tension needs: T = k (l / c - 1) at the
+    solution."""
     _, changes = pulled
     eq = vsr.solve(scene(control="length", stiffness=500.0), changes, model=STEPS, throw=True)
     rest = vsr.solve(scene(), jnp.zeros(2), model=STEPS).lengths
@@ -69,13 +71,16 @@ def test_elastic_cable_gives_way(pulled):
 
 
 def test_friction_along_an_arc_is_the_closed_form():
-    """One tendon at distance d bends by k = T d / EI, so T' = -mu k T gives T = T_0 / (1 + mu d T_0 X / EI)."""
+    """One tendon at distance d bends by k = T d / EI, so T' = -mu k T gives T = T_0 / (1 + mu d T_0
+    X / EI)."""
     d, mu, tension = 0.007, 0.3, 2.0
     EI = 1e6 * np.pi / 4 * 0.01**4
     X = np.array([0.0, 0.1, 0.21, 0.3])
     for motion, sign in (("pull", 1), ("release", -1)):
         tendon = vsr.Tendon(vsr.Parallel(d, 0.0), friction=mu, motion=motion)
-        eq = vsr.solve(vsr.Scene(ARM, [tendon]), [tension], model=vsr.StrainDependent(16), throw=True)
+        eq = vsr.solve(
+            vsr.Scene(ARM, [tendon]), [tension], model=vsr.StrainDependent(16), throw=True
+        )
         want = tension / (1 + sign * mu * d * tension * X / EI)
         np.testing.assert_allclose(np.abs(eq.strain(X)[:, 2]) * EI / d, want, rtol=1e-7)
 
@@ -98,22 +103,37 @@ class Corner(vsr.routing.Routing):
 
 
 def test_a_corner_of_the_path_holds_tension_back():
-    r"""Over a corner of angle $\Delta$ a tendon keeps $e^{-\mu \Delta}$ of its tension, or the inverse when it is let go."""
+    r"""Over a corner of angle $\Delta$ a tendon keeps $e^{-\mu \Delta}$ of its tension, or the
+    inverse when it is let go."""
     modulus, angle = 1e13, 2 * np.arctan(0.05)
     rod = vsr.Rod(0.3, vsr.Circular(0.02), vsr.Material(modulus, poisson=0.3))
     for motion, factor in (("pull", np.exp(-0.3 * angle)), ("release", np.exp(0.3 * angle))):
         tendon = vsr.Tendon(Corner(0.05, 0.1), friction=0.3, motion=motion)
         eq = vsr.solve(vsr.Scene(rod, [tendon]), [2.0], model=STEPS, throw=True)
-        tension = (1 - np.asarray(eq.strain(jnp.array([0.05, 0.2]))[:, 3])) * modulus * np.pi * 0.02**2 / np.cos(angle / 2)
+        tension = (
+            (1 - np.asarray(eq.strain(jnp.array([0.05, 0.2]))[:, 3]))
+            * modulus
+            * np.pi
+            * 0.02**2
+            / np.cos(angle / 2)
+        )
         np.testing.assert_allclose(tension, [2.0, 2.0 * factor], rtol=1e-6)
 
 
 @pytest.mark.slow
 def test_the_kink_where_another_tendon_ends_is_that_of_finer_steps():
-    helices = vsr.Tendon(vsr.Helix(0.007, pitch=0.3), friction=0.3), vsr.Tendon(vsr.Helix(0.007, pitch=0.15, phase=2.0), end=0.15)
+    helices = (
+        vsr.Tendon(vsr.Helix(0.007, pitch=0.3), friction=0.3),
+        vsr.Tendon(vsr.Helix(0.007, pitch=0.15, phase=2.0), end=0.15),
+    )
     kinked = vsr.Scene(ARM, helices, [vsr.Gravity()])
-    coarse, fine = (vsr.solve(kinked, [4.0, 8.0], model=vsr.StrainDependent(steps), throw=True).tip[:3, 3] for steps in (16, 64))
-    shot = vsr.solve(kinked, [4.0, 8.0], model=vsr.Continuum(derivative=vsr.StrainDependent(64)), throw=True).tip[:3, 3]
+    coarse, fine = (
+        vsr.solve(kinked, [4.0, 8.0], model=vsr.StrainDependent(steps), throw=True).tip[:3, 3]
+        for steps in (16, 64)
+    )
+    shot = vsr.solve(
+        kinked, [4.0, 8.0], model=vsr.Continuum(derivative=vsr.StrainDependent(64)), throw=True
+    ).tip[:3, 3]
     np.testing.assert_allclose(coarse, fine, atol=2e-6)
     np.testing.assert_allclose(shot, fine, atol=2e-8)
 
@@ -123,7 +143,10 @@ def test_friction_agrees_between_the_models():
     rubbing = scene([vsr.Gravity()], friction=0.2)
     tips = [
         vsr.solve(rubbing, TENSIONS, model=model, throw=True).tip[:3, 3]
-        for model in (vsr.StrainDependent(24), vsr.Prescribed(vsr.Basis.uniform(vsr.Legendre(7)), steps=16))
+        for model in (
+            vsr.StrainDependent(24),
+            vsr.Prescribed(vsr.Basis.uniform(vsr.Legendre(7)), steps=16),
+        )
     ]
     np.testing.assert_allclose(tips[1], tips[0], atol=2e-7)
 
@@ -150,11 +173,17 @@ def test_jumps_in_everything_agree_with_the_continuum():
         vsr.Material(vsr.Piecewise([0.12], [1e6, 6e5]), poisson=0.45),
         rest_strain=(0.0, vsr.Piecewise([0.2], [0.5, -2.0]), 0.0, 1.0, 0.0, 0.0),
     )
-    threads = [vsr.Thread(vsr.Helix(0.006, pitch=0.3), end=0.23), vsr.Thread(vsr.Parallel(0.0, 0.005), start=0.07)]
+    threads = [
+        vsr.Thread(vsr.Helix(0.006, pitch=0.3), end=0.23),
+        vsr.Thread(vsr.Parallel(0.0, 0.005), start=0.07),
+    ]
     jumps = vsr.Scene(rod, threads)
     tips = [
         vsr.solve(jumps, [-2.0, -1.0], model=model, throw=True).tip
-        for model in (vsr.StrainDependent(40), vsr.Continuum(rtol=1e-10, atol=1e-12, derivative=STEPS))
+        for model in (
+            vsr.StrainDependent(40),
+            vsr.Continuum(rtol=1e-10, atol=1e-12, derivative=STEPS),
+        )
     ]
     np.testing.assert_allclose(tips[1], tips[0], atol=1e-8)
 
@@ -169,13 +198,20 @@ def test_locked_strains_keep_their_rest_value():
 EFFECTS = {
     "dead load, length and end": ([vsr.TipWrench((0.0, 0.0, 0.03))], {}),
     "all": (
-        [vsr.Gravity(), vsr.PointWrench(0.15, force=(0.0, 0.05, 0.0), frame="body"), vsr.TipWrench((0.0, 0.0, 0.03))],
+        [
+            vsr.Gravity(),
+            vsr.PointWrench(0.15, force=(0.0, 0.05, 0.0), frame="body"),
+            vsr.TipWrench((0.0, 0.0, 0.03)),
+        ],
         {"friction": 0.2},
     ),
 }
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=pytest.mark.slow if name == "all" else []) for name in EFFECTS])
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=pytest.mark.slow if name == "all" else []) for name in EFFECTS],
+)
 def test_gradients_through_effects(name):
     """Reverse mode = central differences, by every number of the scene and by the inputs."""
     loads, options = EFFECTS[name]
@@ -196,7 +232,13 @@ def test_gradients_through_effects(name):
     for i, x in enumerate(np.asarray(numbers)):
         unit, h = jnp.zeros_like(numbers).at[i].set(1.0), 1e-4 * abs(x) or 1e-5
         difference = (both(numbers + h * unit)[0] - both(numbers - h * unit)[0]) / (2 * h)
-        np.testing.assert_allclose(reverse[i], difference, rtol=1e-4, atol=1e-7 * (1 + abs(reverse[i])), err_msg=f"number {i}, value {x}")
+        np.testing.assert_allclose(
+            reverse[i],
+            difference,
+            rtol=1e-4,
+            atol=1e-7 * (1 + abs(reverse[i])),
+            err_msg=f"number {i}, value {x}",
+        )
 
 
 def test_reverse_mode_by_the_lengths_alone_is_traced():
@@ -217,20 +259,33 @@ def test_forward_mode_is_reverse_mode():
         return eq.tip[2, 3] + eq.forces[0]
 
     at = jnp.array([-0.01, -0.005])
-    np.testing.assert_allclose(jax.jit(jax.jacfwd(height))(at), jax.jit(jax.jacrev(height))(at), rtol=1e-8)
+    np.testing.assert_allclose(
+        jax.jit(jax.jacfwd(height))(at), jax.jit(jax.jacrev(height))(at), rtol=1e-8
+    )
 
 
 def test_vmap_over_lengths(pulled):
     _, changes = pulled
-    driven, batch = scene(control="length"), jnp.stack([changes, changes.at[1].set(0.05), 0.5 * changes])
+    driven, batch = (
+        scene(control="length"),
+        jnp.stack([changes, changes.at[1].set(0.05), 0.5 * changes]),
+    )
     tips = jax.jit(jax.vmap(lambda change: vsr.solve(driven, change, model=STEPS).tip))(batch)
     np.testing.assert_allclose(tips[0], vsr.solve(driven, changes, model=STEPS).tip, atol=1e-10)
 
 
 def test_a_scene_names_its_effects():
     full = vsr.Scene(
-        ARM, [vsr.Tendon(vsr.Parallel(0.0, 0.005), control="length", friction=0.1)], [vsr.Gravity(), vsr.TipWrench(frame="body")]
+        ARM,
+        [vsr.Tendon(vsr.Parallel(0.0, 0.005), control="length", friction=0.1)],
+        [vsr.Gravity(), vsr.TipWrench(frame="body")],
     )
-    assert full.effects == ("tendons", "gravity", "follower tip wrench", "length control", "friction")
+    assert full.effects == (
+        "tendons",
+        "gravity",
+        "follower tip wrench",
+        "length control",
+        "friction",
+    )
     assert scene().effects == ("tendons",)
     assert eqx.tree_equal(vsr.Scene(ARM, []).effects, ())

@@ -1,4 +1,5 @@
-"""The command: a scene file solved, the paper's table and figures for one case, and errors in one line."""
+"""The command: a scene file solved, the paper's table and figures for one case, and errors in one
+line."""
 
 import contextlib
 import io
@@ -12,8 +13,9 @@ import numpy as np
 import pytest
 
 import vsr_jax
-from vsr_jax import cli, cli_common, cli_scene, paper
-from vsr_jax.scenefile import parse_scene
+from vsr_jax.cli import common as cli_common, main as cli, scene_commands as cli_scene
+from vsr_jax.files.scene_file import parse_scene
+from vsr_jax.studies import paper
 
 HELIX = str(pathlib.Path(__file__).parents[1] / "notebooks" / "scenes" / "helix.toml")
 
@@ -34,7 +36,18 @@ class Run(NamedTuple):
 def solve_helix(folder, tau) -> Run:
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = cli.main(["solve", HELIX, "--inputs", tau, "--json", str(folder / "arm.json"), "--plot", str(folder / "arm.png")])
+        code = cli.main(
+            [
+                "solve",
+                HELIX,
+                "--inputs",
+                tau,
+                "--json",
+                str(folder / "arm.json"),
+                "--plot",
+                str(folder / "arm.png"),
+            ]
+        )
     return Run(code, out.getvalue(), err.getvalue(), folder)
 
 
@@ -54,8 +67,16 @@ def test_solve_saves_the_papers_helix(solved):
     assert solved.code == cli_common.DONE
     arm, expected = solved.arm, paper.reference("B1")[0]
     assert expected.tau == -15.0
-    assert (arm["status"], arm["converged"], arm["precision"], arm["inputs"]) == ("converged", True, "float64", [-15.0])
-    assert (arm["title"], arm["model"]) == ("One helical thread (case B1 of the paper)", "StrainDependent")
+    assert (arm["status"], arm["converged"], arm["precision"], arm["inputs"]) == (
+        "converged",
+        True,
+        "float64",
+        [-15.0],
+    )
+    assert (arm["title"], arm["model"]) == (
+        "One helical thread (case B1 of the paper)",
+        "StrainDependent",
+    )
     np.testing.assert_allclose(arm["tip"], expected.tip, atol=1e-5)
     np.testing.assert_allclose(arm["X"], np.linspace(0.0, 0.75, 41))
     np.testing.assert_allclose(np.array(arm["position"])[::2], expected.position, atol=1e-5)
@@ -73,7 +94,9 @@ def test_solve_prints_the_result_in_words(solved):
     assert status.startswith("  status     converged (StrainDependent, float64, ")
     assert effects == "  effects    threads"
     numbers = re.fullmatch(r"  tip        \((.*), (.*), (.*)\) m", tip).groups()
-    np.testing.assert_allclose([float(x) for x in numbers], paper.reference("B1")[0].tip[:3, 3], atol=1e-5)
+    np.testing.assert_allclose(
+        [float(x) for x in numbers], paper.reference("B1")[0].tip[:3, 3], atol=1e-5
+    )
     assert [axis[:13] for axis in axes] == ["  its x axis ", "  its y axis ", "  its z axis "]
     assert stability.startswith("  stability  ")
     assert head.split() == ["actuator", "input", "force", "[N]", "length", "[m]"]
@@ -94,9 +117,18 @@ def test_a_solve_that_fails_says_why(collapsed):
     ("arguments", "message"),
     [
         (["nowhere.toml"], "vsr-jax: nowhere.toml: No such file or directory"),
-        ([HELIX, "--inputs", "1", "2"], r"vsr-jax: inputs: got shape \(2,\), need \(1,\), one number each for Thread"),
-        ([HELIX, "--inputs", "nan"], r"vsr-jax: inputs\[0\]: got nan, need a finite number \[N\] for a Thread"),
-        ([HELIX, "--json", "no/such/arm.json"], "vsr-jax: no/such/arm.json: there is no folder 'no/such'"),
+        (
+            [HELIX, "--inputs", "1", "2"],
+            r"vsr-jax: inputs: got shape \(2,\), need \(1,\), one number each for Thread",
+        ),
+        (
+            [HELIX, "--inputs", "nan"],
+            r"vsr-jax: inputs\[0\]: got nan, need a finite number \[N\] for a Thread",
+        ),
+        (
+            [HELIX, "--json", "no/such/arm.json"],
+            "vsr-jax: no/such/arm.json: there is no folder 'no/such'",
+        ),
     ],
     ids=["file", "number of inputs", "nan", "folder"],
 )
@@ -112,10 +144,15 @@ def test_a_file_without_inputs_asks_for_them(tmp_path, capsys):
     path = tmp_path / "arm.toml"
     path.write_text(re.sub("inputs = .*", "", pathlib.Path(HELIX).read_text()))
     assert cli.main(["solve", str(path)]) == cli_common.BAD_USAGE
-    assert "arm.toml: holds no inputs, need --inputs, one number each for Thread" in capsys.readouterr().err
+    assert (
+        "arm.toml: holds no inputs, need --inputs, one number each for Thread"
+        in capsys.readouterr().err
+    )
 
 
-@pytest.mark.parametrize("option", [["--model", "exact"], ["--precision", "float16"], ["--inputs", "many"]])
+@pytest.mark.parametrize(
+    "option", [["--model", "exact"], ["--precision", "float16"], ["--inputs", "many"]]
+)
 def test_arguments_that_cannot_be_read_exit_with_2(option, capsys):
     with pytest.raises(SystemExit) as exit_:
         cli.main(["solve", HELIX, *option])
@@ -169,8 +206,24 @@ def test_version(capsys):
 
 
 def test_sweep_keeps_and_draws_a_workspace(tmp_path, capsys):
-    arguments = ["sweep", HELIX, "--samples", "50", "--low", "-15", "--high", "-1", "--steps", "8", "--outputs", "lengths"]
-    assert cli.main([*arguments, "--out", str(tmp_path / "w.zarr"), "--plot", str(tmp_path / "w.png")]) == cli_common.DONE
+    arguments = [
+        "sweep",
+        HELIX,
+        "--samples",
+        "50",
+        "--low",
+        "-15",
+        "--high",
+        "-1",
+        "--steps",
+        "8",
+        "--outputs",
+        "lengths",
+    ]
+    assert (
+        cli.main([*arguments, "--out", str(tmp_path / "w.zarr"), "--plot", str(tmp_path / "w.png")])
+        == cli_common.DONE
+    )
     out = capsys.readouterr().out
     assert "inputs      -15 to -1\nsamples     50 converged\ntip x" in out
     assert (tmp_path / "w.png").stat().st_size > 10_000
@@ -180,18 +233,31 @@ def test_sweep_keeps_and_draws_a_workspace(tmp_path, capsys):
     (tmp_path / "w.zarr" / "status" / "c" / "0").unlink()
     assert cli.main([*arguments, "--out", str(tmp_path / "w.zarr")]) == cli_common.DONE
     said = capsys.readouterr().err.splitlines()[0]
-    assert said.startswith(f"vsr-jax: sweep.out: {tmp_path / 'w.zarr'} has missing or damaged chunks")
+    assert said.startswith(
+        f"vsr-jax: sweep.out: {tmp_path / 'w.zarr'} has missing or damaged chunks"
+    )
     assert said.endswith(": status[0:50]")
 
 
 def test_a_sweep_to_disk_without_zarr_is_one_line(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "zarr", None)
-    assert cli.main(["sweep", HELIX, "--low", "-5", "--out", str(tmp_path / "w.zarr")]) == cli_common.BAD_USAGE
-    assert capsys.readouterr().err == 'vsr-jax: sweep.out: Zarr is not installed, need pip install "vsr-jax[sweep]"\n'
+    assert (
+        cli.main(["sweep", HELIX, "--low", "-5", "--out", str(tmp_path / "w.zarr")])
+        == cli_common.BAD_USAGE
+    )
+    assert (
+        capsys.readouterr().err
+        == 'vsr-jax: sweep.out: Zarr is not installed, need pip install "vsr-jax[sweep]"\n'
+    )
 
 
 def test_a_sweep_without_a_solution_exits_with_1(capsys):
-    assert cli.main(["sweep", HELIX, "--samples", "3", "--low", "-9e3", "--high", "-5e3", "--steps", "8"]) == cli_common.NOT_CONVERGED
+    assert (
+        cli.main(
+            ["sweep", HELIX, "--samples", "3", "--low", "-9e3", "--high", "-5e3", "--steps", "8"]
+        )
+        == cli_common.NOT_CONVERGED
+    )
     assert "samples     3 collapsed\n" in capsys.readouterr().out
 
 
@@ -202,13 +268,18 @@ def test_bounds_of_a_sweep_are_in_order(capsys):
 
 def test_bounds_of_a_sweep_are_one_or_one_an_actuator(capsys):
     assert cli.main(["sweep", HELIX, "--low", "1", "2"]) == cli_common.BAD_USAGE
-    assert "--low: got 2 numbers, need one for all actuators or 1, one for each" in capsys.readouterr().err
+    assert (
+        "--low: got 2 numbers, need one for all actuators or 1, one for each"
+        in capsys.readouterr().err
+    )
 
 
 def test_a_tolerance_chooses_the_steps_and_tells_the_error(capsys):
     assert cli.main(["solve", HELIX, "--tolerance", "1e-4"]) == cli_common.DONE
     error = re.search(
-        r"  error      (\S+) m of the tip against a finer solve, with StrainDependent\(steps=(\d+), order=6\)", capsys.readouterr().out
+        r"  error      (\S+) m of the tip against a finer solve, with "
+        r"StrainDependent\(steps=(\d+), order=6\)",
+        capsys.readouterr().out,
     )
     assert error
     assert 1e-6 < float(error[1]) < 1e-4
@@ -217,4 +288,6 @@ def test_a_tolerance_chooses_the_steps_and_tells_the_error(capsys):
 
 def test_a_tolerance_goes_without_steps(capsys):
     assert cli.main(["solve", HELIX, "--tolerance", "1e-4", "--steps", "8"]) == cli_common.BAD_USAGE
-    assert "--tolerance: got --model or --steps too, need one or the other" in capsys.readouterr().err
+    assert (
+        "--tolerance: got --model or --steps too, need one or the other" in capsys.readouterr().err
+    )

@@ -1,4 +1,5 @@
-"""What CONTRIBUTING.md and CITATION.cff say: the examples run, the drawing of the layout is true, the version is the package's."""
+"""What CONTRIBUTING.md and CITATION.cff say: the examples run, the drawing of the layout is true,
+the version is the package's."""
 
 import pathlib
 import re
@@ -17,9 +18,16 @@ HEADINGS = ["A load", "A routing", "A basis", "A model", "An objective and a con
 
 def blocks(language):
     """Code blocks of a language, each with the heading it stands under."""
-    parts = re.split(r"^## (.+)\n", (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8"), flags=re.MULTILINE)
+    parts = re.split(
+        r"^## (.+)\n", (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8"), flags=re.MULTILINE
+    )
     for heading, text in zip(parts[1::2], parts[2::2], strict=True):
-        yield from ((heading, code) for code in re.findall(rf"^```{language}\n(.*?)^```$", text, flags=re.MULTILINE | re.DOTALL))
+        yield from (
+            (heading, code)
+            for code in re.findall(
+                rf"^```{language}\n(.*?)^```$", text, flags=re.MULTILINE | re.DOTALL
+            )
+        )
 
 
 EXAMPLES = list(blocks("python"))
@@ -40,7 +48,8 @@ def test_an_example_is_short_and_true(code, tmp_path):
 
 
 def boxes():
-    """Modules of each box of the drawing, from the top; remarks in parentheses and what flows between boxes left out."""
+    """Modules of each box of the drawing, from the top; remarks in parentheses and what flows
+    between boxes left out."""
     found = []
     for line in dict(blocks("text"))["Layout"].splitlines():
         if "|" not in line:
@@ -58,9 +67,18 @@ def test_the_drawing_holds_modules_that_exist_once_each():
 
 def test_no_box_of_the_drawing_imports_from_one_below():
     places = {module: i for i, box in enumerate(boxes()) for module in box}
-    upward = {(module, other) for module in places for other in imports(FOLDER / f"{module}.py") if places.get(other, 0) > places[module]}
-    assert upward == {("scene", "scenefile")}  # looked up when it is called: a scene knows how to save itself
+    upward = {
+        (module, other)
+        for module in places
+        for other in imports(FOLDER / f"{module}.py")
+        if places.get(other, 0) > places[module]
+    }
+    assert upward == {
+        ("scene", "scenefile")
+    }  # looked up when it is called: a scene knows how to save itself
 
 
 def test_the_citation_has_the_version_of_the_package():
-    assert f"\nversion: {vsr_jax.__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    assert f"\nversion: {vsr_jax.__version__}\n" in (ROOT / "CITATION.cff").read_text(
+        encoding="utf-8"
+    )

@@ -20,7 +20,10 @@ def operations(scene):
     def walk(jaxpr):
         for equation in jaxpr.eqns:
             counts[equation.primitive.name] += 1
-            for value in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda x: hasattr(x, "jaxpr") or hasattr(x, "eqns")):
+            for value in jax.tree.leaves(
+                list(equation.params.values()),
+                is_leaf=lambda x: hasattr(x, "jaxpr") or hasattr(x, "eqns"),
+            ):
                 if hasattr(value, "jaxpr") or hasattr(value, "eqns"):
                     walk(getattr(value, "jaxpr", value))
 
@@ -36,7 +39,9 @@ def plain():
 
 def test_tendons_alone_have_no_pass_along_the_arm(plain):
     assert plain["while"] == 1
-    assert not any(plain[name] for name in ("scan", "sin", "cos", "exp", "cumsum", "custom_linear_solve", "lu"))
+    assert not any(
+        plain[name] for name in ("scan", "sin", "cos", "exp", "cumsum", "custom_linear_solve", "lu")
+    )
 
 
 def test_gravity_brings_the_passes_and_nothing_else():
@@ -47,13 +52,17 @@ def test_gravity_brings_the_passes_and_nothing_else():
 
 def test_follower_loads_alone_carry_the_change_of_the_force():
     dead = operations(vsr.Scene(ARM, [vsr.Tendon(PATH)], [vsr.TipWrench((0.0, 0.0, 0.1))]))
-    follower = operations(vsr.Scene(ARM, [vsr.Tendon(PATH)], [vsr.TipWrench((0.0, 0.0, 0.1), frame="body")]))
+    follower = operations(
+        vsr.Scene(ARM, [vsr.Tendon(PATH)], [vsr.TipWrench((0.0, 0.0, 0.1), frame="body")])
+    )
     assert follower["mul"] > dead["mul"] + 50
 
 
 def test_only_given_lengths_solve_for_tensions(plain):
     driven = operations(vsr.Scene(ARM, [vsr.Tendon(PATH, control="length")]))
-    assert driven["scan"] == 3  # the factors of the tensions' system and both substitutions, no pass along the arm
+    assert (
+        driven["scan"] == 3
+    )  # the factors of the tensions' system and both substitutions, no pass along the arm
     assert not any(driven[name] for name in ("sin", "cos", "cumsum", "lu"))
 
 
@@ -65,7 +74,9 @@ def test_only_friction_has_the_capstan(plain):
 
 
 def test_free_strains_give_the_solve_their_size(plain):
-    bending = operations(vsr.Scene(ARM, [vsr.Tendon(PATH)], free_strains=("bending_y", "bending_z")))
+    bending = operations(
+        vsr.Scene(ARM, [vsr.Tendon(PATH)], free_strains=("bending_y", "bending_z"))
+    )
     assert bending["div"] < plain["div"] - 15
     assert bending["sqrt"] <= plain["sqrt"] - 4
 

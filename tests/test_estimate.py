@@ -1,4 +1,5 @@
-"""Error estimates: against solutions at far more steps, and against the reference solutions of the paper's cases."""
+"""Error estimates: against solutions at far more steps, and against the reference solutions of the
+paper's cases."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +7,7 @@ import numpy as np
 import pytest
 
 import vsr_jax as vsr
-from vsr_jax import paper
+from vsr_jax.studies import paper
 
 HELICES = paper.scene("B2")
 PULL = jnp.array([-8.0, -5.0])
@@ -24,19 +25,32 @@ def tip_distance(a, b):
 @pytest.mark.parametrize(("steps", "order"), [(8, 6), (16, 6), (13, 6), (16, 4), (64, 2)])
 def test_tip_error_of_the_steps(steps, order):
     eq = vsr.solve(HELICES, PULL, model=vsr.StrainDependent(steps, order))
-    honest(float(eq.error.tip), tip_distance(eq, vsr.solve(HELICES, PULL, model=vsr.StrainDependent(160))))
+    honest(
+        float(eq.error.tip),
+        tip_distance(eq, vsr.solve(HELICES, PULL, model=vsr.StrainDependent(160))),
+    )
 
 
 def test_tip_error_of_one_step_and_of_an_arm_in_pieces():
-    tapering, stiff = vsr.Circular(vsr.Taper(0.012, 0.010)), vsr.Material(vsr.Piecewise((0.1,), (8e5, 4e5)), poisson=0.45)
-    for young, routing, steps in ((vsr.Material(8e5, poisson=0.45), vsr.Parallel(0.005, 0.0), 1), (stiff, vsr.Helix(0.007, 1.0), 6)):
+    tapering, stiff = (
+        vsr.Circular(vsr.Taper(0.012, 0.010)),
+        vsr.Material(vsr.Piecewise((0.1,), (8e5, 4e5)), poisson=0.45),
+    )
+    for young, routing, steps in (
+        (vsr.Material(8e5, poisson=0.45), vsr.Parallel(0.005, 0.0), 1),
+        (stiff, vsr.Helix(0.007, 1.0), 6),
+    ):
         scene = vsr.Scene(vsr.Rod(0.3, tapering, young), [vsr.Tendon(routing)])
         eq = vsr.solve(scene, [1.0], model=vsr.StrainDependent(steps))
-        honest(float(eq.error.tip), tip_distance(eq, vsr.solve(scene, [1.0], model=vsr.StrainDependent(64))))
+        honest(
+            float(eq.error.tip),
+            tip_distance(eq, vsr.solve(scene, [1.0], model=vsr.StrainDependent(64))),
+        )
 
 
 class Softened(vsr.StrainDependent):
-    """A model of somebody else's that finds a hundredth too little strain, and says that it is approximate."""
+    """A model of somebody else's that finds a hundredth too little strain, and says that it is
+    approximate."""
 
     balanced_everywhere = False
 
@@ -49,8 +63,11 @@ class Softened(vsr.StrainDependent):
 
 
 def test_a_model_that_is_not_balanced_is_not_taken_for_one_that_is():
-    """Its strain is compared with one in balance; as that of a `StrainDependent` it was called exact."""
-    eq, exact = (vsr.solve(HELICES, PULL, model=model) for model in (Softened(16), vsr.StrainDependent(16)))
+    """Its strain is compared with one in balance; as that of a `StrainDependent` it was called
+    exact."""
+    eq, exact = (
+        vsr.solve(HELICES, PULL, model=model) for model in (Softened(16), vsr.StrainDependent(16))
+    )
     X = jnp.linspace(0.01, 0.7, 9)
     wrong = np.max(np.abs(np.asarray(eq.strain(X) - exact.strain(X))), axis=0)
     assert np.all(wrong <= np.asarray(eq.error.strain))
@@ -66,7 +83,11 @@ def test_errors_against_the_independent_reference():
 
 
 @pytest.mark.parametrize(
-    "model", [vsr.Prescribed(paper.basis("B2")), pytest.param(vsr.Continuum(rtol=1e-5, atol=1e-7), marks=pytest.mark.slow)]
+    "model",
+    [
+        vsr.Prescribed(paper.basis("B2")),
+        pytest.param(vsr.Continuum(rtol=1e-5, atol=1e-7), marks=pytest.mark.slow),
+    ],
 )
 def test_errors_of_the_other_models(model):
     eq, exact = (vsr.solve(HELICES, PULL, model=m) for m in (model, vsr.StrainDependent(160)))
@@ -78,7 +99,9 @@ def test_errors_of_the_other_models(model):
 
 def loaded(**of_the_tendon):
     arm = vsr.Rod(0.3, vsr.Circular(0.01), vsr.Material(5.93e5, shear=2e5, density=1000.0))
-    return vsr.Scene(arm, [vsr.Tendon(vsr.Helix(0.005, 1.5), **of_the_tendon)], [vsr.Gravity((0.0, 0.0, -9.81))])
+    return vsr.Scene(
+        arm, [vsr.Tendon(vsr.Helix(0.005, 1.5), **of_the_tendon)], [vsr.Gravity((0.0, 0.0, -9.81))]
+    )
 
 
 @pytest.mark.parametrize(
@@ -92,14 +115,22 @@ def loaded(**of_the_tendon):
 def test_errors_under_loads(tendon, value):
     scene, inputs = loaded(**tendon), jnp.array([value])
     eq = vsr.solve(scene, inputs, model=vsr.StrainDependent(6))
-    honest(float(eq.error.tip), tip_distance(eq, vsr.solve(scene, inputs, model=vsr.StrainDependent(32))))
+    honest(
+        float(eq.error.tip),
+        tip_distance(eq, vsr.solve(scene, inputs, model=vsr.StrainDependent(32))),
+    )
 
 
 @pytest.mark.slow
 def test_errors_of_a_basis_under_loads():
     scene, inputs = loaded(), jnp.array([8.0])
-    eq = vsr.solve(scene, inputs, model=vsr.Prescribed(vsr.Basis.uniform(vsr.Legendre(4)), steps=12))
-    honest(float(eq.error.tip), tip_distance(eq, vsr.solve(scene, inputs, model=vsr.StrainDependent(32))))
+    eq = vsr.solve(
+        scene, inputs, model=vsr.Prescribed(vsr.Basis.uniform(vsr.Legendre(4)), steps=12)
+    )
+    honest(
+        float(eq.error.tip),
+        tip_distance(eq, vsr.solve(scene, inputs, model=vsr.StrainDependent(32))),
+    )
 
 
 def test_rounding_counts():
@@ -110,6 +141,8 @@ def test_rounding_counts():
 
 
 def test_error_of_a_failed_solve_is_nan_and_it_batches():
-    tips = jax.vmap(lambda u: vsr.solve(HELICES, u, model=vsr.StrainDependent(16)).error.tip)(jnp.stack([PULL, 1e4 * PULL]))
+    tips = jax.vmap(lambda u: vsr.solve(HELICES, u, model=vsr.StrainDependent(16)).error.tip)(
+        jnp.stack([PULL, 1e4 * PULL])
+    )
     assert np.isfinite(tips[0])
     assert np.isnan(tips[1])

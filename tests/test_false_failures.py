@@ -1,4 +1,5 @@
-"""Ordinary scenes are not refused: small versions of the search for false failures, and the program by which it judges."""
+"""Ordinary scenes are not refused: small versions of the search for false failures, and the program
+by which it judges."""
 
 import json
 
@@ -26,9 +27,16 @@ def draws(name, count, seed=1):
 def straight_column(weight):
     """An upright rod of a given weight by $EI / L^3$, without a load at its tip."""
     numbers = draws("tip wrench and gravity", 1)[0]
-    bending, area = numbers["young"] * np.pi * numbers["radius"] ** 4 / 4, np.pi * numbers["radius"] ** 2
+    bending, area = (
+        numbers["young"] * np.pi * numbers["radius"] ** 4 / 4,
+        np.pi * numbers["radius"] ** 2,
+    )
     gravity = weight * bending / numbers["length"] ** 3 / (1000.0 * area)
-    loads = {"gravity": [-gravity, 0.0, 0.0], "tip world force": [0.0] * 3, "tip world moment": [0.0] * 3}
+    loads = {
+        "gravity": [-gravity, 0.0, 0.0],
+        "tip world force": [0.0] * 3,
+        "tip world moment": [0.0] * 3,
+    }
     return numbers | loads | {"tip_radius": numbers["radius"], "curvature": [0.0, 0.0]}
 
 
@@ -47,7 +55,11 @@ def test_the_independent_tangent_is_that_of_differences(name):
     random = np.random.default_rng(0)
     scale = np.array([1, 1, 1, 0.01, 0.01, 0.01])
     xi = arm.rest + scale * (0.3 * random.normal(size=6) + 0.1 * np.sin(3 * arm.middle)[:, None])
-    tension, change, pull = np.ones(len(arm.driven)), scale * np.sin(2 * arm.middle + 0.3)[:, None], random.normal(size=len(arm.driven))
+    tension, change, pull = (
+        np.ones(len(arm.driven)),
+        scale * np.sin(2 * arm.middle + 0.3)[:, None],
+        random.normal(size=len(arm.driven)),
+    )
     ahead, behind = (arm.system(xi + e * change, tension + e * pull, 0.7)[0] for e in (1e-6, -1e-6))
     found = arm.system(xi, tension, 0.7)[1] @ np.concatenate([change.reshape(-1), pull])
     expected = (ahead - behind) / 2e-6
@@ -66,7 +78,15 @@ def test_ordinary_scenes_are_not_refused(name):
 def test_an_upright_arm_with_a_chamber_at_rest_stands_or_is_unstable():
     name = "upright, chamber at rest"
     structure, drawn = STRUCTURES[name], draws(name, 24)
-    solved = jax.jit(jax.vmap(lambda numbers: vsr.solve(*built(structure, numbers), model=vsr.StrainDependent(16)).status))
+    solved = jax.jit(
+        jax.vmap(
+            lambda numbers: (
+                vsr.solve(*built(structure, numbers), model=vsr.StrainDependent(16)).status
+            )
+        )
+    )
     stands = np.array([Arm(structure, numbers).follow().arrived for numbers in drawn])
     assert 4 < np.sum(stands) < 20
-    np.testing.assert_array_equal(solved(stack(drawn)), np.where(stands, vsr.Status.CONVERGED, vsr.Status.UNSTABLE))
+    np.testing.assert_array_equal(
+        solved(stack(drawn)), np.where(stands, vsr.Status.CONVERGED, vsr.Status.UNSTABLE)
+    )

@@ -1,4 +1,5 @@
-"""Forward mode = reverse mode = differences of the solve, whatever a scene has; and batches over every number of a scene."""
+"""Forward mode = reverse mode = differences of the solve, whatever a scene has; and batches over
+every number of a scene."""
 
 import jax
 import jax.numpy as jnp
@@ -20,35 +21,47 @@ def arm(young=1e6):
 
 
 def rubbing(loads=(), young=1e6, **options):
-    return vsr.Scene(arm(young), [vsr.Tendon(path, friction=0.2, **options) for path in PATHS], loads)
+    return vsr.Scene(
+        arm(young), [vsr.Tendon(path, friction=0.2, **options) for path in PATHS], loads
+    )
 
 
 def slopes(function, at, step=5e-3):
     """Fourth-order differences by numbers of any size, each with a step that is a share of it."""
     h = step * np.asarray(at)
-    return central_differences(lambda unit: np.asarray(function(at + h * unit)), at.size) / h.reshape(-1, *(1,) * jnp.ndim(function(at)))
+    return central_differences(
+        lambda unit: np.asarray(function(at + h * unit)), at.size
+    ) / h.reshape(-1, *(1,) * jnp.ndim(function(at)))
 
 
 @pytest.fixture(scope="module")
 def deflection():
-    """Deflection of an arm under friction, by its modulus and the tensions, and its gradient in reverse mode."""
+    """Deflection of an arm under friction, by its modulus and the tensions, and its gradient in
+    reverse mode."""
 
     def tip(young, tensions):
-        return jnp.array([0.3, 1.0, -0.7]) @ vsr.solve(rubbing(young=young), tensions, model=STEPS).tip[:3, 3]
+        return (
+            jnp.array([0.3, 1.0, -0.7])
+            @ vsr.solve(rubbing(young=young), tensions, model=STEPS).tip[:3, 3]
+        )
 
     return jax.value_and_grad(tip, (0, 1))
 
 
 def test_reverse_mode_under_friction_is_the_difference(deflection):
-    """A solution of the transposed tangent system that is judged by its residual alone was off by 2e-4 here."""
+    """A solution of the transposed tangent system that is judged by its residual alone was off by
+    2e-4 here."""
     both, at = jax.jit(deflection), jnp.array([1e6, *TENSIONS])
     reverse = jnp.hstack(both(at[0], at[1:])[1]) * at
     differences = slopes(lambda x: both(x[0], x[1:])[0], at) * at
-    np.testing.assert_allclose(reverse, differences, rtol=0, atol=1e-8 * np.linalg.norm(differences))
+    np.testing.assert_allclose(
+        reverse, differences, rtol=0, atol=1e-8 * np.linalg.norm(differences)
+    )
 
 
 def test_modulus_batched_alone_under_friction(deflection):
-    """`jax.vmap` over one number of the scene; the shape depends on the tensions by the modulus alone."""
+    """`jax.vmap` over one number of the scene; the shape depends on the tensions by the modulus
+    alone."""
     moduli = jnp.array([7e5, 1e6, 2e6])
     values, (by_young, by_tensions) = jax.jit(jax.vmap(deflection, (0, None)))(moduli, TENSIONS)
     np.testing.assert_allclose(moduli * by_young, -by_tensions @ TENSIONS, rtol=1e-9)
@@ -56,12 +69,24 @@ def test_modulus_batched_alone_under_friction(deflection):
 
 
 def test_locked_strains_that_single_precision_cannot_hold():
-    """A tendon at the distance d that takes in c bends an inextensible arm by c / d L; EI of that is T d."""
+    """A tendon at the distance d that takes in c bends an inextensible arm by c / d L; EI of that
+    is T d."""
     d, taken_in = 0.007, 0.01
-    rod = vsr.Rod(0.3, vsr.Circular(0.01), vsr.Material(1e6, poisson=0.45), rest_strain=(0.0, 0.0, 0.0, 1.1, 0.0, 0.0))
-    scene = vsr.Scene(rod, [vsr.Tendon(vsr.Parallel(d, 0.0), control="length")], free_strains=("bending_y", "bending_z"))
+    rod = vsr.Rod(
+        0.3,
+        vsr.Circular(0.01),
+        vsr.Material(1e6, poisson=0.45),
+        rest_strain=(0.0, 0.0, 0.0, 1.1, 0.0, 0.0),
+    )
+    scene = vsr.Scene(
+        rod,
+        [vsr.Tendon(vsr.Parallel(d, 0.0), control="length")],
+        free_strains=("bending_y", "bending_z"),
+    )
     eq = vsr.solve(scene, [-taken_in], model=STEPS, throw=True)
-    np.testing.assert_allclose(-eq.forces[0], 1e6 * np.pi / 4 * 0.01**4 * taken_in / (d**2 * 0.3), rtol=1e-10)
+    np.testing.assert_allclose(
+        -eq.forces[0], 1e6 * np.pi / 4 * 0.01**4 * taken_in / (d**2 * 0.3), rtol=1e-10
+    )
 
 
 CASES = {
@@ -90,11 +115,14 @@ def test_both_modes_are_the_differences(name):
 
     differences = slopes(lambda x: both(x)[0], at).T * at
     for jacobian in both(at)[1:]:
-        np.testing.assert_allclose(jacobian, differences, rtol=0, atol=1e-8 * np.linalg.norm(differences))
+        np.testing.assert_allclose(
+            jacobian, differences, rtol=0, atol=1e-8 * np.linalg.norm(differences)
+        )
 
 
 def full():
-    """A scene with everything and its inputs; two wrenches at one place would be no smooth case: their kinks add up once apart."""
+    """A scene with everything and its inputs; two wrenches at one place would be no smooth case:
+    their kinks add up once apart."""
     rod = vsr.Rod(
         0.3,
         vsr.Circular(vsr.Taper(0.011, 0.009)),
@@ -123,9 +151,12 @@ def mixture(scene, inputs):
 
 @pytest.fixture(scope="module")
 def everything():
-    """All numbers of the full scene in a row, a direction, and what gives the value, the gradient and the derivative along it."""
+    """All numbers of the full scene in a row, a direction, and what gives the value, the gradient
+    and the derivative along it."""
     numbers, rebuild = ravel_pytree(full())
-    way = np.random.default_rng(3).normal(size=numbers.size) * np.where(numbers == 0, 1e-2, np.abs(numbers))
+    way = np.random.default_rng(3).normal(size=numbers.size) * np.where(
+        numbers == 0, 1e-2, np.abs(numbers)
+    )
 
     def derivatives(x, v):
         gradient = jax.grad(lambda x: mixture(*rebuild(x)))(x)
@@ -151,12 +182,15 @@ def test_every_number_batched_at_once_is_the_loop(everything):
     together = jax.jit(jax.vmap(derivatives, (0, None)))(batch, way)
     for i, x in enumerate(batch):
         for found, alone in zip(together, single(x, way), strict=True):
-            np.testing.assert_allclose(found[i], alone, rtol=1e-9, atol=1e-12 * np.max(np.abs(alone)))
+            np.testing.assert_allclose(
+                found[i], alone, rtol=1e-9, atol=1e-12 * np.max(np.abs(alone))
+            )
 
 
 @pytest.mark.slow
 def test_every_number_may_be_batched_alone():
-    """By tracing: the value and the gradient, with one leaf of the scene batched and the others not."""
+    """By tracing: the value and the gradient, with one leaf of the scene batched and the others
+    not."""
     leaves, tree = jax.tree.flatten(full())
 
     for i, leaf in enumerate(leaves):
@@ -174,13 +208,22 @@ def test_a_design_of_a_modulus_under_friction_runs():
     wanted = vsr.solve(rubbing(young=8e5), TENSIONS, model=STEPS).tip[:3, 3]
     objective = vsr.objective.TipError(wanted[None])
     found = vsr.design(
-        scene, {"rod.material.young": (5e5, 2e6)}, objective, inputs, model=STEPS, starts=2, tried=2, steps=3, progress=False
+        scene,
+        {"rod.material.young": (5e5, 2e6)},
+        objective,
+        inputs,
+        model=STEPS,
+        starts=2,
+        candidates=2,
+        steps=3,
+        progress=False,
     )
     assert 5e5 < float(found.scene.rod.material.young.value) < 1e6
 
 
 def test_what_the_search_takes_for_wrong():
-    """Of the sine at 1, computed with noise: a difference too rough to tell is no agreement, and a derivative off by 1e-6 is wrong."""
+    """Of the sine at 1, computed with noise: a difference too rough to tell is no agreement, and a
+    derivative off by 1e-6 is wrong."""
     from benchmarks.gradient_search import Found, difference, verdict
 
     steps, exact, random = 0.02 * 0.5 ** np.arange(11), np.cos(1.0), np.random.default_rng(0)
@@ -190,18 +233,28 @@ def test_what_the_search_takes_for_wrong():
         assert abs(found[0] - exact) <= found[1]
         assert verdict(Found(0, exact, exact, *found)) == words
     found = difference(odd, steps)
-    assert verdict(Found(0, exact * (1 + 1e-6), exact * (1 + 1e-6), *found)) == "wrong: not the difference"
+    assert (
+        verdict(Found(0, exact * (1 + 1e-6), exact * (1 + 1e-6), *found))
+        == "wrong: not the difference"
+    )
     assert verdict(Found(0, exact, exact * (1 + 1e-6), *found)) == "wrong: the modes differ"
     assert verdict(Found(0, exact, np.nan, *found)) == "NaN in one mode"
     assert verdict(Found(6, 0.0, 1.0, *found)).startswith("wrong")
-    assert verdict(Found(0, exact, exact, *difference(np.full(steps.size, np.nan), steps))) == "at a switch"
+    assert (
+        verdict(Found(0, exact, exact, *difference(np.full(steps.size, np.nan), steps)))
+        == "at a switch"
+    )
 
 
 @pytest.mark.slow
 def test_a_dozen_drawn_scenes_have_the_right_gradient_or_none():
     from benchmarks.gradient_search import search, structures, verdict
 
-    chosen = [made for made in structures(12) if len(made.effects) in (4, 5) and (made.pull or made.release)][:3]
+    chosen = [
+        made
+        for made in structures(12)
+        if len(made.effects) in (4, 5) and (made.pull or made.release)
+    ][:3]
     said = [verdict(found) for made in chosen for found in search(made, 4)]
     assert not [words for words in said if words.startswith("wrong")], said
     assert said.count("agrees") >= 8, said

@@ -1,7 +1,9 @@
-"""Hard arms under loads: a table with what must come out of each, arms of all sizes, and the two-section arm with six tendons.
+"""Hard arms under loads: a table with what must come out of each, arms of all sizes, and the
+two-section arm with six tendons.
 
-All arms of the table are one structure, in which everything may jump: two radii, two materials, a thread that ends, and a
-load of each kind, so that one compiled program a precision solves them all. Loads are without unit: forces by $EI / L^2$.
+All arms of the table are one structure, in which everything may jump: two radii, two materials, a
+thread that ends, and a load of each kind, so that one compiled program a precision solves them all.
+Loads are without unit: forces by $EI / L^2$.
 """
 
 import math
@@ -22,12 +24,25 @@ AXIAL = 1e6 * math.pi * 0.01**2
 BENDING = AXIAL * 0.01**2 / 4
 
 
-def arm(*, weight=0.0, down=(0.0, 0.0, -1.0), dead=(0.0, 0.0, 0.0), follower=(0.0, 0.0, 0.0), middle=(0.0, 0.0, 0.0), jumps=1.0):
-    """A clamped arm with its weight $\\rho g A L^3 / EI$, forces at its tip and a force at 0.25 m; radius and modulus jump by a factor."""
+def arm(
+    *,
+    weight=0.0,
+    down=(0.0, 0.0, -1.0),
+    dead=(0.0, 0.0, 0.0),
+    follower=(0.0, 0.0, 0.0),
+    middle=(0.0, 0.0, 0.0),
+    jumps=1.0,
+):
+    """A clamped arm with its weight $\\rho g A L^3 / EI$, forces at its tip and a force at 0.25 m;
+    radius and modulus jump by a factor."""
     force = BENDING / LENGTH**2
     gravity = weight * force / LENGTH / (1000 * math.pi * 0.01**2)
     section = vsr.Circular(vsr.Piecewise((0.1,), (0.01, 0.01 * jumps)))
-    rod = vsr.Rod(LENGTH, section, vsr.Material(vsr.Piecewise((0.15,), (1e6, 1e6 * jumps)), poisson=0.45, density=1000.0))
+    rod = vsr.Rod(
+        LENGTH,
+        section,
+        vsr.Material(vsr.Piecewise((0.15,), (1e6, 1e6 * jumps)), poisson=0.45, density=1000.0),
+    )
     loads = [
         vsr.Gravity(tuple(gravity * x for x in down)),
         vsr.PointWrench(0.25, force=tuple(force * x for x in middle)),
@@ -38,7 +53,8 @@ def arm(*, weight=0.0, down=(0.0, 0.0, -1.0), dead=(0.0, 0.0, 0.0), follower=(0.
 
 
 class Case(NamedTuple):
-    """A hard arm: its tension [N], the status that must come out, the tip [1/L] where it is known, and the error of eight steps."""
+    """A hard arm: its tension [N], the status that must come out, the tip [1/L] where it is known,
+    and the error of eight steps."""
 
     scene: vsr.Scene
     tension: float = 0.0
@@ -55,23 +71,43 @@ UNSTABLE, COLLAPSED, NOT_FINITE = vsr.Status.UNSTABLE, vsr.Status.COLLAPSED, vsr
 TABLE = {
     "nothing": Case(arm(), 0.0, (1.0, 0.0, 0.0)),
     "jumps in everything": Case(
-        arm(weight=9.0, dead=(0.0, 1.0, 0.0), follower=(0.0, 0.0, 1.0), middle=(0.0, -2.0, 0.0), jumps=0.7), 2.0, coarse=3e-5
+        arm(
+            weight=9.0,
+            dead=(0.0, 1.0, 0.0),
+            follower=(0.0, 0.0, 1.0),
+            middle=(0.0, -2.0, 0.0),
+            jumps=0.7,
+        ),
+        2.0,
+        coarse=3e-5,
     ),
     "hangs down from its clamp": Case(arm(weight=100.0), coarse=2e-4),
     "falls over and hangs through itself": Case(arm(weight=100.0, down=UP), 0.1, coarse=1e-3),
-    "column below its weight's limit": Case(arm(weight=7.0, down=UP), 0.0, (1 - 3.5 * SHORT, 0.0, 0.0)),
+    "column below its weight's limit": Case(
+        arm(weight=7.0, down=UP), 0.0, (1 - 3.5 * SHORT, 0.0, 0.0)
+    ),
     "column beyond its weight's limit": Case(arm(weight=8.5, down=UP), status=UNSTABLE),
-    "two radii and moduli beyond their weight's limit": Case(arm(weight=30.0, down=UP, jumps=0.5), status=UNSTABLE),
+    "two radii and moduli beyond their weight's limit": Case(
+        arm(weight=30.0, down=UP, jumps=0.5), status=UNSTABLE
+    ),
     "strut below Euler's load": Case(arm(dead=(-2.3, 0.0, 0.0)), 0.0, (1 - 2.3 * SHORT, 0.0, 0.0)),
     "strut beyond Euler's load": Case(arm(dead=(-2.7, 0.0, 0.0)), status=UNSTABLE),
     "strut beyond Euler's load, nudged": Case(arm(dead=(-2.7, 0.0, 0.0)), 0.05, coarse=1e-6),
-    "strut at eight times Euler's load, nudged": Case(arm(dead=(-20.0, 0.0, 0.0)), 0.05, coarse=1e-4),
-    "strut at eight times Euler's load, nudged from the side": Case(arm(dead=(-20.0, 1e-3, 0.0)), 0.05, coarse=1e-4),
+    "strut at eight times Euler's load, nudged": Case(
+        arm(dead=(-20.0, 0.0, 0.0)), 0.05, coarse=1e-4
+    ),
+    "strut at eight times Euler's load, nudged from the side": Case(
+        arm(dead=(-20.0, 1e-3, 0.0)), 0.05, coarse=1e-4
+    ),
     "falls over sideways": Case(arm(weight=100.0, down=(-1.0, 1e-4, 0.0)), 0.1, coarse=1e-3),
-    "follower beyond its first critical value": Case(arm(follower=(-25.0, 0.0, 0.0)), 0.0, (1 - 25 * SHORT, 0.0, 0.0)),
+    "follower beyond its first critical value": Case(
+        arm(follower=(-25.0, 0.0, 0.0)), 0.0, (1 - 25 * SHORT, 0.0, 0.0)
+    ),
     "follower from the side": Case(arm(follower=(0.0, 0.0, 20.0)), coarse=1e-4),
     "tension of 1e-300": Case(arm(weight=9.0), 1e-300, coarse=1e-5),
-    "tension past collapse": Case(arm(weight=9.0), 1.1 / (1 / AXIAL + 0.005**2 / BENDING), status=COLLAPSED),
+    "tension past collapse": Case(
+        arm(weight=9.0), 1.1 / (1 / AXIAL + 0.005**2 / BENDING), status=COLLAPSED
+    ),
     "tension of 1e300": Case(arm(weight=9.0), 1e300, status=COLLAPSED),
     "not a number": Case(arm(weight=9.0), math.nan, status=NOT_FINITE),
 }
@@ -79,7 +115,8 @@ TABLE = {
 
 @jax.jit
 def answer(scene, tension, v):
-    """A number made from the tip, and tip [1/L], status and margin, at a change v of tension and weight."""
+    """A number made from the tip, and tip [1/L], status and margin, at a change v of tension and
+    weight."""
     unit = jnp.where(jnp.abs(tension) > 1e-200, 1e-4 * jnp.abs(tension), 1e-4)
     gravity = scene.loads[0].acceleration
     changed = eqx.tree_at(lambda scene: scene.loads[0].acceleration, scene, gravity + 1e-3 * v[1])
@@ -96,7 +133,10 @@ def at(function, case, dtype, change=(0.0, 0.0)):
     """What a function of scene, tension and change gives for a case."""
     with np.errstate(over="ignore"):
         tension = np.array(case.tension).astype(dtype)
-    return jax.tree.map(np.asarray, function(case.scene.astype(dtype), jnp.asarray(tension), jnp.array(change, dtype)))
+    return jax.tree.map(
+        np.asarray,
+        function(case.scene.astype(dtype), jnp.asarray(tension), jnp.array(change, dtype)),
+    )
 
 
 def differences(function, case):
@@ -107,7 +147,9 @@ def differences(function, case):
 CONVERGED = [name for name, case in TABLE.items() if case.status == vsr.Status.CONVERGED]
 
 
-PRECISIONS = pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
+PRECISIONS = pytest.mark.parametrize(
+    "dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)]
+)
 
 
 @PRECISIONS
@@ -129,7 +171,9 @@ def test_status_and_shape_are_what_they_must_be(name, dtype):
 @pytest.mark.parametrize("name", [name for name in CONVERGED if TABLE[name].coarse > 1e-11])
 def test_twice_the_steps_give_the_same_shape(name):
     case = TABLE[name]
-    np.testing.assert_allclose(at(answer, case, "float64")[1][0], at(finer, case, "float64"), atol=case.coarse)
+    np.testing.assert_allclose(
+        at(answer, case, "float64")[1][0], at(finer, case, "float64"), atol=case.coarse
+    )
 
 
 @jax.jit
@@ -138,7 +182,8 @@ def finer(scene, tension, _):
 
 
 def rounding(margin, dtype):
-    """Error [L] of the shape in its softest motion: a balance to rounding, 64 epsilon, over the margin."""
+    """Error [L] of the shape in its softest motion: a balance to rounding, 64 epsilon, over the
+    margin."""
     return 64 * epsilon(dtype) / max(margin, 1e-4) * (margin > 0)
 
 
@@ -146,26 +191,37 @@ def rounding(margin, dtype):
 @pytest.mark.parametrize("name", CONVERGED)
 def test_gradients_are_those_of_differences(name):
     case, (found, _) = TABLE[name], at(gradient, TABLE[name], "float64")
-    np.testing.assert_allclose(found, differences(answer, case), atol=3e-6 * np.max(np.abs(found)) + 1e-13)
+    np.testing.assert_allclose(
+        found, differences(answer, case), atol=3e-6 * np.max(np.abs(found)) + 1e-13
+    )
 
 
 @pytest.mark.slow  # compiling takes minutes
 @pytest.mark.parametrize("name", CONVERGED)
 def test_derivatives_in_both_precisions_are_those_of_differences(name, dtype):
-    case, (found, (_, _, margin)), (bend, _) = TABLE[name], at(gradient, TABLE[name], dtype), at(hessian, TABLE[name], dtype)
+    case, (found, (_, _, margin)), (bend, _) = (
+        TABLE[name],
+        at(gradient, TABLE[name], dtype),
+        at(hessian, TABLE[name], dtype),
+    )
     near = max(3e-5 if dtype == "float64" else 3e-3, rounding(margin, dtype))
     slope, curve = differences(answer, case), differences(gradient, case)
     largest = np.max(np.abs(slope))
     np.testing.assert_allclose(found, slope, atol=near * largest)
-    np.testing.assert_allclose(bend, curve, atol=near * np.max(np.abs(curve)) + 100 * epsilon(dtype) * largest)
+    np.testing.assert_allclose(
+        bend, curve, atol=near * np.max(np.abs(curve)) + 100 * epsilon(dtype) * largest
+    )
 
 
 def similar_arm(length, young):
-    """An arm that hangs from the horizontal, whose numbers without unit do not depend on its size: weight $\\rho g A L^3 / EI = 9$."""
+    """An arm that hangs from the horizontal, whose numbers without unit do not depend on its size:
+    weight $\\rho g A L^3 / EI = 9$."""
     radius = length / 30
     density = 9 * young * radius**2 / (4 * 9.81 * length**3)
     rod = vsr.Rod(length, vsr.Circular(radius), vsr.Material(young, poisson=0.45, density=density))
-    return vsr.Scene(rod, [vsr.Tendon(vsr.Parallel(0.7 * radius, 0.0))], [vsr.Gravity()]), 0.01 * young * math.pi * radius**2
+    return vsr.Scene(
+        rod, [vsr.Tendon(vsr.Parallel(0.7 * radius, 0.0))], [vsr.Gravity()]
+    ), 0.01 * young * math.pi * radius**2
 
 
 @jax.jit
@@ -190,22 +246,36 @@ def test_arms_of_all_sizes_and_stiffnesses_behave_alike(length, young, dtype):
 
 
 def six_tendon_arm(loads=()):
-    """Two sections of 0.2 m; tendons at 10 mm, at 90, -30 and 210 degrees, three to the middle and three to the end."""
+    """Two sections of 0.2 m; tendons at 10 mm, at 90, -30 and 210 degrees, three to the middle and
+    three to the end."""
     rod = vsr.Rod(0.4, vsr.Circular(0.0007), vsr.Material(54e9, poisson=0.3), guide_radius=0.0101)
-    places = [(0.01 * math.cos(angle), 0.01 * math.sin(angle)) for angle in (math.pi / 2, -math.pi / 6, 7 * math.pi / 6)]
-    return vsr.Scene(rod, [vsr.Tendon(vsr.Parallel(*place), end=end) for end in (0.2, None) for place in places], loads)
+    places = [
+        (0.01 * math.cos(angle), 0.01 * math.sin(angle))
+        for angle in (math.pi / 2, -math.pi / 6, 7 * math.pi / 6)
+    ]
+    return vsr.Scene(
+        rod,
+        [vsr.Tendon(vsr.Parallel(*place), end=end) for end in (0.2, None) for place in places],
+        loads,
+    )
 
 
 @pytest.fixture(scope="module")
 def draws():
     random = np.random.default_rng(0)
-    sizes = [(0, 5, 6), (-0.1, 0.1, 3), (-5e-3, 5e-3, 3)]  # tensions [N], tip forces [N] and moments [N m]
+    sizes = [
+        (0, 5, 6),
+        (-0.1, 0.1, 3),
+        (-5e-3, 5e-3, 3),
+    ]  # tensions [N], tip forces [N] and moments [N m]
     return [jnp.asarray(random.uniform(low, high, (200, count))) for low, high, count in sizes]
 
 
 def test_six_tendons_pulled_at_random_converge(draws):
     scene = six_tendon_arm()
-    status, margin = jax.jit(jax.vmap(lambda t: (lambda eq: (eq.status, eq.stability))(vsr.solve(scene, t, model=MODEL))))(draws[0])
+    status, margin = jax.jit(
+        jax.vmap(lambda t: (lambda eq: (eq.status, eq.stability))(vsr.solve(scene, t, model=MODEL)))
+    )(draws[0])
     assert np.all(status == vsr.Status.CONVERGED)
     assert np.all(margin > 1 - 1e-9)
 
@@ -213,7 +283,9 @@ def test_six_tendons_pulled_at_random_converge(draws):
 @pytest.mark.slow
 def test_six_tendons_with_random_tip_wrenches_converge(draws):
     def solved(tensions, force, moment):
-        return vsr.solve(six_tendon_arm([vsr.TipWrench(force=force, moment=moment)]), tensions, model=MODEL)
+        return vsr.solve(
+            six_tendon_arm([vsr.TipWrench(force=force, moment=moment)]), tensions, model=MODEL
+        )
 
     eqs = jax.jit(jax.vmap(solved))(*draws)
     assert np.all(eqs.converged)
@@ -227,10 +299,13 @@ RATIOS, SIZES = (10.0, 40.0, 80.0, 200.0, 400.0, 1000.0, 3000.0), (1.0, 3.0, 10.
 
 
 def tip_loads(directions):
-    """Radius [m] and tip force [N] of an arm of 0.4 m and 10 MPa for all ratios, sizes and directions."""
+    """Radius [m] and tip force [N] of an arm of 0.4 m and 10 MPa for all ratios, sizes and
+    directions."""
     vectors = np.random.default_rng(0).normal(size=(directions, 3))
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
-    ratio, size, place = (x.reshape(-1) for x in np.meshgrid(RATIOS, SIZES, np.arange(directions), indexing="ij"))
+    ratio, size, place = (
+        x.reshape(-1) for x in np.meshgrid(RATIOS, SIZES, np.arange(directions), indexing="ij")
+    )
     radius = 0.4 / ratio
     return radius, vectors[place] * (size * 1e7 * math.pi * radius**4 / 4 / 0.4**2)[:, None]
 
@@ -240,14 +315,22 @@ def under_tip_loads(dtype, steps, directions):
 
     def one(radius, force):
         rod = vsr.Rod(0.4, vsr.Circular(radius), vsr.Material(1e7, poisson=0.4))
-        eq = vsr.solve(vsr.Scene(rod, [], [vsr.TipWrench(force)]), jnp.zeros(0, dtype), model=vsr.StrainDependent(steps))
+        eq = vsr.solve(
+            vsr.Scene(rod, [], [vsr.TipWrench(force)]),
+            jnp.zeros(0, dtype),
+            model=vsr.StrainDependent(steps),
+        )
         return eq.status, eq.tip[:3, 3] / 0.4, eq.steps
 
-    return [np.asarray(x) for x in jax.jit(jax.vmap(one))(*(jnp.asarray(x, dtype) for x in tip_loads(directions)))]
+    return [
+        np.asarray(x)
+        for x in jax.jit(jax.vmap(one))(*(jnp.asarray(x, dtype) for x in tip_loads(directions)))
+    ]
 
 
 def test_arms_of_every_slenderness_bear_a_tip_force():
-    """Thin arms were refused while their solve still converged. How many steps it takes does not depend on the slenderness."""
+    """Thin arms were refused while their solve still converged. How many steps it takes does not
+    depend on the slenderness."""
     status, _, taken = under_tip_loads("float64", 16, 5)
     assert np.all(status == vsr.Status.CONVERGED)
     mean = np.mean(taken.reshape(len(RATIOS), -1), axis=1)
@@ -257,7 +340,8 @@ def test_arms_of_every_slenderness_bear_a_tip_force():
 @pytest.mark.slow
 @pytest.mark.parametrize("steps", [16, 32])
 def test_arms_of_every_slenderness_bear_a_tip_force_in_a_hundred_directions(steps):
-    """In single precision too, where the tips of slender arms were wrong by up to a hundredth of the length."""
+    """In single precision too, where the tips of slender arms were wrong by up to a hundredth of
+    the length."""
     status, tips, _ = under_tip_loads("float64", steps, 100)
     assert np.all(status == vsr.Status.CONVERGED)
     rough_status, rough_tips, _ = under_tip_loads("float32", steps, 100)
@@ -267,27 +351,43 @@ def test_arms_of_every_slenderness_bear_a_tip_force_in_a_hundred_directions(step
 
 
 def test_a_catheter_bears_a_tip_force_in_any_direction():
-    """Two of a hundred were refused: four tendons in a wire of 1 mm and 60 GPa, 0.5 N at its tip."""
+    """Two of a hundred were refused: four tendons in a wire of 1 mm and 60 GPa, 0.5 N at its
+    tip."""
     random = np.random.default_rng(1)
     forces = random.normal(size=(200, 3))
     forces *= 0.5 / np.linalg.norm(forces, axis=1, keepdims=True)
     rod = vsr.Rod(0.2, vsr.Circular(diameter=0.001), vsr.Material(60e9, poisson=0.3))
-    places = [(0.0004 * math.cos(angle), 0.0004 * math.sin(angle)) for angle in np.arange(4) * math.pi / 2]
+    places = [
+        (0.0004 * math.cos(angle), 0.0004 * math.sin(angle)) for angle in np.arange(4) * math.pi / 2
+    ]
     threads = [vsr.Tendon(vsr.Parallel(*place)) for place in places]
 
     def status(tensions, force):
-        return vsr.solve(vsr.Scene(rod, threads, [vsr.TipWrench(force)]), tensions, model=vsr.StrainDependent(16)).status
+        return vsr.solve(
+            vsr.Scene(rod, threads, [vsr.TipWrench(force)]), tensions, model=vsr.StrainDependent(16)
+        ).status
 
-    found = jax.jit(jax.vmap(status))(jnp.asarray(random.uniform(0, 3, (200, 4))), jnp.asarray(forces))
+    found = jax.jit(jax.vmap(status))(
+        jnp.asarray(random.uniform(0, 3, (200, 4))), jnp.asarray(forces)
+    )
     assert np.all(found == vsr.Status.CONVERGED)
 
 
 def test_a_tapered_arm_of_silicone_upright_under_its_weight_is_unstable():
-    """At exactly zero pressure nothing tips it over; the straight equilibrium is found, and is none that stays."""
+    """At exactly zero pressure nothing tips it over; the straight equilibrium is found, and is none
+    that stays."""
 
     def status(pressure):
-        rod = vsr.Rod(0.3, vsr.Circular(vsr.Taper(0.010, 0.004)), vsr.Material(1e5, poisson=0.45, density=1080.0))
-        scene = vsr.Scene(rod, [vsr.Chamber(vsr.Parallel(0.0, 0.003), area=1e-5)], [vsr.Gravity((-9.81, 0.0, 0.0))])
+        rod = vsr.Rod(
+            0.3,
+            vsr.Circular(vsr.Taper(0.010, 0.004)),
+            vsr.Material(1e5, poisson=0.45, density=1080.0),
+        )
+        scene = vsr.Scene(
+            rod,
+            [vsr.Chamber(vsr.Parallel(0.0, 0.003), area=1e-5)],
+            [vsr.Gravity((-9.81, 0.0, 0.0))],
+        )
         return vsr.solve(scene, pressure[None], model=MODEL).status
 
     found = jax.jit(jax.vmap(status))(jnp.array([0.0, 100.0]))

@@ -1,4 +1,5 @@
-"""Health reports: distances to failure that are known in closed form, conditioning, and what is said in words."""
+"""Health reports: distances to failure that are known in closed form, conditioning, and what is
+said in words."""
 
 import json
 import math
@@ -9,7 +10,8 @@ import numpy as np
 import pytest
 
 import vsr_jax as vsr
-from vsr_jax import cli, paper, report
+from vsr_jax.cli import main as cli, report
+from vsr_jax.studies import paper
 
 LENGTH, RADIUS = 0.3, 0.01
 AXIAL = 1e6 * math.pi * RADIUS**2
@@ -24,14 +26,22 @@ def rod(density=None):
 @pytest.fixture(scope="module")
 def twins():
     """Two threads in one place."""
-    return vsr.check(vsr.Scene(rod(), [vsr.Tendon(vsr.Parallel(0.0, 0.008))] * 2), jnp.array([1.0, 1.0]), model=MODEL)
+    return vsr.check(
+        vsr.Scene(rod(), [vsr.Tendon(vsr.Parallel(0.0, 0.008))] * 2),
+        jnp.array([1.0, 1.0]),
+        model=MODEL,
+    )
 
 
 @pytest.fixture(scope="module")
 def strut():
     """A strut of half of Euler's load, with a thread on its axis."""
     load = vsr.TipWrench(force=(-0.5 * math.pi**2 / 4 * BENDING / LENGTH**2, 0.0, 0.0))
-    return vsr.check(vsr.Scene(rod(), [vsr.Tendon(vsr.Parallel(0.0, 0.0))], [load]), jnp.array([0.0]), model=vsr.StrainDependent(16))
+    return vsr.check(
+        vsr.Scene(rod(), [vsr.Tendon(vsr.Parallel(0.0, 0.0))], [load]),
+        jnp.array([0.0]),
+        model=vsr.StrainDependent(16),
+    )
 
 
 def test_tensions_may_grow_until_the_path_is_used_up(twins):
@@ -50,9 +60,13 @@ def test_the_papers_arm_collapses_at_93_newtons():
 def test_twin_threads_are_not_independent(twins):
     assert abs(twins.independence) < 1e-14
     assert "threads do what others do" in " ".join(report.health_lines(twins))
-    apart = vsr.Scene(rod(), [vsr.Tendon(vsr.Parallel(0.0, 0.008)), vsr.Tendon(vsr.Parallel(0.008, 0.0))])
+    apart = vsr.Scene(
+        rod(), [vsr.Tendon(vsr.Parallel(0.0, 0.008)), vsr.Tendon(vsr.Parallel(0.008, 0.0))]
+    )
     health = vsr.check(apart, jnp.array([1.0, 1.0]), model=MODEL)
-    coupling = (1 / AXIAL) / (1 / AXIAL + 0.008**2 / BENDING)  # of the two, through the elongation alone
+    coupling = (1 / AXIAL) / (
+        1 / AXIAL + 0.008**2 / BENDING
+    )  # of the two, through the elongation alone
     np.testing.assert_allclose(health.independence, 1 - coupling, rtol=1e-9)
     assert report.health_lines(health)[-1] == "  advice       all is well"
 
@@ -72,7 +86,9 @@ def test_no_finer_steps_are_needed_for_an_arc(twins):
 
 
 def test_it_goes_through_jit(twins):
-    again = eqx.filter_jit(lambda scene, inputs: vsr.check(scene, inputs, model=MODEL))(twins.equilibrium.scene, twins.equilibrium.inputs)
+    again = eqx.filter_jit(lambda scene, inputs: vsr.check(scene, inputs, model=MODEL))(
+        twins.equilibrium.scene, twins.equilibrium.inputs
+    )
     np.testing.assert_allclose(again.inputs.factor, twins.inputs.factor)
 
 
@@ -90,13 +106,26 @@ def test_a_failed_solve_gets_a_remedy():
 
 def test_the_command_prints_and_saves_the_report(tmp_path, capsys):
     path = tmp_path / "arm.toml"
-    path.write_text(vsr.Scene(rod(), [vsr.Tendon(vsr.Parallel(0.0, 0.008))]).to_toml([1.0], "An arm"))
-    code = cli.main(["check", str(path), "--input", "12", "--steps", "4", "--json", str(tmp_path / "health.json")])
+    vsr.save(vsr.Scene(rod(), [vsr.Tendon(vsr.Parallel(0.0, 0.008))]), path, [1.0], "An arm")
+    code = cli.main(
+        [
+            "check",
+            str(path),
+            "--input",
+            "12",
+            "--steps",
+            "4",
+            "--json",
+            str(tmp_path / "health.json"),
+        ]
+    )
     out = capsys.readouterr().out
     assert code == 0
     assert out.startswith("An arm\n  status     converged (StrainDependent, float64, ")
     assert "may grow together to" in out
     assert "then collapsed" in out
     saved = json.loads((tmp_path / "health.json").read_text())
-    np.testing.assert_allclose(12 * saved["inputs"]["factor"], 1 / (1 / AXIAL + 0.008**2 / BENDING), rtol=1e-3)
+    np.testing.assert_allclose(
+        12 * saved["inputs"]["factor"], 1 / (1 / AXIAL + 0.008**2 / BENDING), rtol=1e-3
+    )
     assert saved["advice"] == ["all is well"]

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import vsr_jax as vsr
-from vsr_jax import cli, cli_common, inverse
+from vsr_jax.analysis import inverse
+from vsr_jax.cli import common as cli_common, main as cli
 
 MODEL = vsr.StrainDependent(8)
 MOST = 12.0
@@ -24,18 +25,25 @@ def scene():
 
 @pytest.fixture(scope="module")
 def reached(scene):
-    """Inputs drawn, their tips with one more that is out of reach by 20 um and one by far, and what is found for these."""
+    """Inputs drawn, their tips with one more that is out of reach by 20 um and one by far, and what
+    is found for these."""
     drawn = jnp.asarray(np.random.default_rng(3).uniform(0.2, MOST, (7, 3)))
     tips = jax.vmap(lambda u: vsr.solve(scene, u, model=MODEL).tip[:3, 3])(drawn)
     targets = jnp.concatenate([tips, jnp.array([[0.75 + 2e-5, 0.0, 0.0], [2.0, 0.0, 0.0]])])
-    return drawn, targets, jax.vmap(lambda target: vsr.reach(scene, target, (0.0, MOST), model=MODEL))(targets)
+    return (
+        drawn,
+        targets,
+        jax.vmap(lambda target: vsr.reach(scene, target, (0.0, MOST), model=MODEL))(targets),
+    )
 
 
 def test_all_that_can_be_reached_are_and_the_inputs_are_found_again(scene, reached):
     drawn, targets, found = reached
     assert np.all(found.reached[:7])
     assert np.all(found.miss[:7] < 1e-9)
-    np.testing.assert_allclose(found.inputs[:7], drawn, atol=1e-8)  # three tendons and three coordinates: there is one way only
+    np.testing.assert_allclose(
+        found.inputs[:7], drawn, atol=1e-8
+    )  # three tendons and three coordinates: there is one way only
     alone = vsr.solve(scene, found.inputs[2], model=MODEL)
     np.testing.assert_allclose(alone.tip[:3, 3], targets[2], atol=1e-9)
 
@@ -59,7 +67,11 @@ def test_what_is_missed_by_less_than_is_allowed_is_reached(reached):
 @pytest.mark.slow
 def test_least_effort_leaves_one_of_two_antagonists_slack():
     arm = vsr.Rod(0.75, vsr.Circular(0.01), vsr.Material(5.93e5, shear=2e5))
-    scene = vsr.Scene(arm, [vsr.Tendon(vsr.Parallel(y, 0.0)) for y in (0.005, -0.005)], free_strains=("bending_z",))
+    scene = vsr.Scene(
+        arm,
+        [vsr.Tendon(vsr.Parallel(y, 0.0)) for y in (0.005, -0.005)],
+        free_strains=("bending_z",),
+    )
     target = vsr.solve(scene, [9.0, 4.0], model=MODEL).tip[:3, 3]
     found = vsr.reach(scene, target, (0.0, MOST), model=MODEL)
     assert bool(found.reached)
@@ -81,14 +93,23 @@ def test_a_pose_and_points_along_the_arm(scene):
 def test_derivatives_by_the_target_are_those_of_differences(place):
     """Four tendons for three coordinates: one is at its bound, or the effort chooses."""
     arm = vsr.Rod(0.75, vsr.Circular(vsr.Taper(0.012, 0.010)), vsr.Material(5.93e5, shear=2e5))
-    ring = [vsr.Tendon(vsr.Parallel(y, z)) for y, z in ((0.005, 0.0), (0.0, 0.005), (-0.005, 0.0), (0.0, -0.005))]
+    ring = [
+        vsr.Tendon(vsr.Parallel(y, z))
+        for y, z in ((0.005, 0.0), (0.0, 0.005), (-0.005, 0.0), (0.0, -0.005))
+    ]
     scene = vsr.Scene(arm, ring)
     target = vsr.solve(scene, place, model=MODEL).tip[:3, 3]
     inputs = jax.jit(lambda target: vsr.reach(scene, target, (0.0, MOST), model=MODEL).inputs)
     assert bool(jnp.any(inputs(target) == 0)) == (place[0] == 0)
     step = 1e-5
     found = jax.jit(jax.jacfwd(inputs))(target)
-    true = np.stack([(inputs(target + step * unit) - inputs(target - step * unit)) / (2 * step) for unit in jnp.eye(3)], axis=1)
+    true = np.stack(
+        [
+            (inputs(target + step * unit) - inputs(target - step * unit)) / (2 * step)
+            for unit in jnp.eye(3)
+        ],
+        axis=1,
+    )
     np.testing.assert_allclose(found, true, rtol=1e-4, atol=1e-5 * np.abs(true).max())
 
 
@@ -97,13 +118,43 @@ def test_derivatives_by_the_target_are_those_of_differences(place):
     [
         ([0.5, 0.1], (0.0, 1.0), {}, r"target: got shape \(2,\), need \(3,\)"),
         ([0.5, 0.1, 0.0], 1.0, {}, r"bounds: got 1.0, need a pair"),
-        ([0.5, 0.1, 0.0], (1.0, 0.0), {}, r"bounds: got \[1. 1. 1.\] to \[0. 0. 0.\], need the least inputs first"),
-        ([0.5, 0.1, 0.0], ([0.0, 0.0], 1.0), {}, r"bounds\[0\]: got shape \(2,\), need one number or 3"),
+        (
+            [0.5, 0.1, 0.0],
+            (1.0, 0.0),
+            {},
+            r"bounds: got \[1. 1. 1.\] to \[0. 0. 0.\], need the least inputs first",
+        ),
+        (
+            [0.5, 0.1, 0.0],
+            ([0.0, 0.0], 1.0),
+            {},
+            r"bounds\[0\]: got shape \(2,\), need one number or 3",
+        ),
         ([0.5, 0.1, 0.0], (-1.0, 1.0), {}, r"inputs\[0\]: got -1, need a finite number >= 0"),
-        ([0.5, 0.1, 0.0], (0.0, 1.0), {"X": [0.1, 0.2]}, r"X: got shape \(2,\) for targets of shape \(3,\)"),
-        ([0.5, 0.1, 0.0], (0.0, 1.0), {"allowed_miss": -1.0}, r"allowed_miss: got -1.0, need a finite number > 0"),
-        ([[0.5, 0.1, 0.0]], (0.0, 1.0), {"X": [9.0]}, r"X: got 9 m, need 0 to 0.75 m, the ends of the arm"),
-        (np.diag([0.0, 0.0, 0.0, 1.0]), (0.0, 1.0), {}, r"target: got a rotation of zeros, need a rigid transform"),
+        (
+            [0.5, 0.1, 0.0],
+            (0.0, 1.0),
+            {"X": [0.1, 0.2]},
+            r"X: got shape \(2,\) for targets of shape \(3,\)",
+        ),
+        (
+            [0.5, 0.1, 0.0],
+            (0.0, 1.0),
+            {"allowed_miss": -1.0},
+            r"allowed_miss: got -1.0, need a finite number > 0",
+        ),
+        (
+            [[0.5, 0.1, 0.0]],
+            (0.0, 1.0),
+            {"X": [9.0]},
+            r"X: got 9 m, need 0 to 0.75 m, the ends of the arm",
+        ),
+        (
+            np.diag([0.0, 0.0, 0.0, 1.0]),
+            (0.0, 1.0),
+            {},
+            r"target: got a rotation of zeros, need a rigid transform",
+        ),
         (np.diag([1.0, 1.0, -1.0, 1.0]), (0.0, 1.0), {}, r"target: got a reflection"),
     ],
 )
@@ -137,7 +188,9 @@ def test_six_digits_of_a_tip_are_reached_and_the_nearest_is_as_exact_as_ever(sce
 def test_points_beyond_the_arm_are_missed_where_they_are_traced(scene):
     one = vsr.Scene(scene.rod, scene.actuators[:1])
     target = vsr.solve(one, [7.0], model=MODEL).position([0.4])
-    found = jax.jit(jax.vmap(lambda X: vsr.reach(one, target, (0.0, MOST), X=X, model=MODEL)))(jnp.array([[0.4], [9.0]]))
+    found = jax.jit(jax.vmap(lambda X: vsr.reach(one, target, (0.0, MOST), X=X, model=MODEL)))(
+        jnp.array([[0.4], [9.0]])
+    )
     np.testing.assert_array_equal(found.reached, [True, False])
     np.testing.assert_allclose(found.inputs[0], [7.0], atol=1e-8)
     assert np.isinf(found.miss[1])
@@ -151,16 +204,41 @@ def test_the_command(tmp_path, capsys, monkeypatch, scene, close):
         assert allowed_miss == 1e-3
         inputs = jnp.array([7.0, 2.0, 4.0])
         miss = jnp.array(2e-4 if close else 0.3)
-        return inverse.Reach(inputs, vsr.solve(scene, inputs, model=model), miss, jnp.array(close), jnp.array(allowed_miss))
+        return inverse.Reach(
+            inputs,
+            vsr.solve(scene, inputs, model=model),
+            miss,
+            jnp.array(close),
+            jnp.array(allowed_miss),
+        )
 
     monkeypatch.setattr(inverse, "reach", reach)
     file, out = tmp_path / "arm.toml", tmp_path / "found.json"
-    file.write_text(scene.to_toml([1.0, 1.0, 1.0]))
-    arguments = ["reach", str(file), "--target", "0.7", "-0.1", "0.2", "--high", "12", "--steps", "8", "--allowed-miss", "1e-3"]
-    assert cli.main([*arguments, "--json", str(out)]) == (cli_common.DONE if close else cli_common.NOT_CONVERGED)
+    vsr.save(scene, file, [1.0, 1.0, 1.0])
+    arguments = [
+        "reach",
+        str(file),
+        "--target",
+        "0.7",
+        "-0.1",
+        "0.2",
+        "--high",
+        "12",
+        "--steps",
+        "8",
+        "--allowed-miss",
+        "1e-3",
+    ]
+    assert cli.main([*arguments, "--json", str(out)]) == (
+        cli_common.DONE if close else cli_common.NOT_CONVERGED
+    )
     text = capsys.readouterr().out
     assert "  inputs     7, 2, 4\n" in text
-    verdict = "0.0002 m, within the" if close else "0.3 m, out of reach, this is the nearest found: more than the"
+    verdict = (
+        "0.0002 m, within the"
+        if close
+        else "0.3 m, out of reach, this is the nearest found: more than the"
+    )
     assert f"  miss       {verdict} 0.001 m allowed\n" in text
     saved = json.loads(out.read_text())
     assert (saved["reached"], saved["allowed_miss"]) == (close, 1e-3)
@@ -170,7 +248,7 @@ def test_the_command(tmp_path, capsys, monkeypatch, scene, close):
 def test_the_command_reaches_the_six_digits_that_it_printed(tmp_path, capsys, scene):
     """Two tendons for a tip in space: no inputs meet rounded digits exactly."""
     file = tmp_path / "arm.toml"
-    file.write_text(vsr.Scene(scene.rod, scene.actuators[:2]).to_toml([7.0, 2.0]))
+    vsr.save(vsr.Scene(scene.rod, scene.actuators[:2]), file, [7.0, 2.0])
     assert cli.main(["solve", str(file), "--steps", "8"]) == cli_common.DONE
     digits = re.search(r"  tip        \((.*), (.*), (.*)\) m", capsys.readouterr().out).groups()
     arguments = ["reach", str(file), "--target", *digits, "--high", "12", "--steps", "8"]

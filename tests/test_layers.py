@@ -1,46 +1,99 @@
-"""The layers of the package: a module imports only from those above it in this list."""
+"""The layout of the package: which package may import which, and what its face shows."""
 
 import ast
 import pathlib
+import subprocess
+import sys
 
 import pytest
 
-import vsr_jax
+import vsr_jax as vsr
 
-FOLDER = pathlib.Path(vsr_jax.__file__).parent
-LAYERS = """
-_types _check bounded box fingerprint component implicit se3 quadrature profile section material routing actuator rod load scene
-parameters newton lu batching balance kinematics resolution cable reaction elimination friction coupled coupled_tangent coupled_solve
-basis model galerkin discrete strain_dependent estimate shooting continuum lanczos stability equilibrium plausible plan solve inverse
-sensitivity objective constraint descent problem checkpoint optimize health continuation parallel labels archive sweep scenefile
-designfile plot film annotate plot_design paper paper_figures reproduce report timing effects accuracy accuracy_figures cli_common
-cli_scene cli_sweep cli_inverse cli_design cli_studies cli
-""".split()  # noqa: SIM905
+FOLDER = pathlib.Path(vsr.__file__).parent
+PACKAGES = (
+    "numerics",
+    "arm",
+    "mechanics",
+    "models",
+    "solution",
+    "files",
+    "analysis",
+    "optimization",
+    "viz",
+    "studies",
+    "cli",
+)
+"""A module imports from its own package and from those before it; `typing` and `validation` serve
+all."""
+MODULES = sorted(path.relative_to(FOLDER).as_posix() for path in FOLDER.glob("*/*.py"))
 
 
 def imports(path):
+    """Places that a file imports from vsr_jax: ("arm", "scene", "Scene")."""
+    own = path.parent.name
     for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom) and (node.level == 1 or (node.module or "").startswith("vsr_jax")):
-            module = (node.module or "").removeprefix("vsr_jax").lstrip(".").split(".")[0]
-            yield from [module] if module else [alias.name for alias in node.names if (FOLDER / f"{alias.name}.py").exists()]
+        if not isinstance(node, ast.ImportFrom):
+            continue
+        parts = (node.module or "").split(".") if node.module else []
+        if node.level == 0:
+            if not parts or parts.pop(0) != "vsr_jax":
+                continue
+        elif node.level == 1:
+            parts = [own, *parts]
+        yield from ((*parts, alias.name) for alias in node.names)
 
 
-def test_every_module_has_its_layer():
-    modules = {path.stem for path in FOLDER.glob("*.py")} - {"__init__"}
-    assert modules == set(LAYERS)
+def test_every_package_is_in_the_list():
+    assert {path.parent.name for path in FOLDER.glob("*/*.py")} == set(PACKAGES)
+    assert {path.stem for path in FOLDER.glob("*.py")} == {"__init__", "typing", "validation"}
 
 
-@pytest.mark.parametrize("name", LAYERS)
-def test_imports_go_upward(name):
-    above = LAYERS[: LAYERS.index(name)]
-    # `Scene.to_toml` looks its writer up when it is called: a scene knows how to save itself.
-    later = ["scenefile"] if name == "scene" else []
-    assert [module for module in imports(FOLDER / f"{name}.py") if module not in above + later] == []
+@pytest.mark.parametrize("name", MODULES)
+def test_imports_go_one_way(name):
+    allowed = PACKAGES[: PACKAGES.index(name.split("/")[0]) + 1]
+    for place in imports(FOLDER / name):
+        assert place[0] in (*allowed, "typing", "validation", "__version__"), place
 
 
-def test_the_public_face_draws_nothing():
-    import subprocess
-    import sys
+@pytest.mark.parametrize("package", PACKAGES)
+def test_a_package_has_no_cycle(package):
+    """Its modules can be put in an order in which each imports only earlier ones."""
+    names = {path.stem for path in (FOLDER / package).glob("*.py")} - {"__init__"}
 
-    code = "import sys, vsr_jax; print([m for m in ('matplotlib', 'diffrax', 'optax', 'optimistix') if m in sys.modules])"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"
+    def needed(name):
+        own = [p for p in imports(FOLDER / package / f"{name}.py") if p[0] == package]
+        return {part for place in own for part in place[1:2] if part in names}
+
+    needs = {name: needed(name) for name in names}
+    while ready := {name for name, others in needs.items() if not others}:
+        needs = {name: others - ready for name, others in needs.items() if name not in ready}
+    assert needs == {}
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_nothing_private_is_imported(name):
+    private = [
+        place
+        for place in imports(FOLDER / name)
+        if any(part.startswith("_") and part != "__version__" for part in place)
+    ]
+    assert private == []
+
+
+def test_no_module_is_called_like_a_public_function():
+    """`import vsr_jax.arm.load`, say, must not be mistaken for `vsr.load`."""
+    modules = {path.stem for path in FOLDER.rglob("*.py")} | set(PACKAGES)
+    functions = {name for name in vsr.__all__ if type(getattr(vsr, name)).__name__ == "function"}
+    assert modules & functions == set()
+
+
+def test_the_face_lists_what_it_has():
+    assert [name for name in vsr.__all__ if not hasattr(vsr, name)] == []
+    assert dir(vsr) == sorted([*vsr.__all__, "__version__"])
+
+
+def test_the_face_imports_no_optimiser_ode_solver_or_picture():
+    heavy = ("matplotlib", "diffrax", "optax", "optimistix", "zarr", "xarray")
+    code = f"import sys, vsr_jax; print([m for m in {heavy} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -4,11 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vsr_jax import lu
+from vsr_jax.numerics import lu
 
 
 def systems(size=7, arms=3):
-    """Matrices with a positive definite symmetric part and right sides, side by side in the last axis."""
+    """Matrices with a positive definite symmetric part and right sides, side by side in the last
+    axis."""
     random = np.random.default_rng(0)
     square = random.normal(size=(arms, size, size))
     skew = square - square.swapaxes(1, 2)
@@ -21,14 +22,20 @@ def test_solutions_are_those_of_numpy():
     expected = np.linalg.solve(np.moveaxis(matrices, -1, 0), right.T[..., None])[..., 0].T
     found = lu.substitute(lu.factor(jnp.asarray(matrices)), jnp.asarray(right))
     np.testing.assert_allclose(found, expected, rtol=1e-11)
-    np.testing.assert_allclose(lu.solve(jnp.asarray(matrices), jnp.asarray(right)), expected, rtol=1e-11)
+    np.testing.assert_allclose(
+        lu.solve(jnp.asarray(matrices), jnp.asarray(right)), expected, rtol=1e-11
+    )
 
 
 def test_the_diagonal_holds_the_ratios_of_leading_minors():
     matrices, _ = systems()
     matrices[3, 3] -= 20.0
-    minors = np.stack([[np.linalg.det(matrices[:k, :k, arm]) for arm in range(3)] for k in range(8)])
-    np.testing.assert_allclose(lu.diagonal(lu.factor(jnp.asarray(matrices))), minors[1:] / minors[:-1], rtol=1e-9)
+    minors = np.stack(
+        [[np.linalg.det(matrices[:k, :k, arm]) for arm in range(3)] for k in range(8)]
+    )
+    np.testing.assert_allclose(
+        lu.diagonal(lu.factor(jnp.asarray(matrices))), minors[1:] / minors[:-1], rtol=1e-9
+    )
     assert np.any(minors < 0)
 
 
@@ -40,4 +47,9 @@ def test_derivatives_of_any_order_in_both_modes():
 
     at = jnp.linspace(0.1, 0.7, 7)
     for derivative in (jax.jacfwd, jax.jacrev, jax.hessian):
-        np.testing.assert_allclose(derivative(value)(at, lu.solve), derivative(value)(at, jnp.linalg.solve), rtol=1e-8, atol=1e-10)
+        np.testing.assert_allclose(
+            derivative(value)(at, lu.solve),
+            derivative(value)(at, jnp.linalg.solve),
+            rtol=1e-8,
+            atol=1e-10,
+        )

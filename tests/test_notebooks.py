@@ -1,4 +1,5 @@
-"""Notebooks: that they are stored without outputs, begin with a title and hold Python that compiles."""
+"""Notebooks: that they are stored without outputs, begin with a title and hold Python that
+compiles."""
 
 import ast
 import json

@@ -1,4 +1,5 @@
-"""Section IV of the paper: every case and tension against the independent reference, and the paper's claims."""
+"""Section IV of the paper: every case and tension against the independent reference, and the
+paper's claims."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +7,7 @@ import numpy as np
 import pytest
 
 import vsr_jax as vsr
-from vsr_jax import paper
+from vsr_jax.studies import paper
 
 L = paper.LENGTH
 EXACT = vsr.StrainDependent(steps=96, order=6)
@@ -19,7 +20,9 @@ def tip_error(eq, reference):
 
 def error_of(case, index, basis):
     reference = paper.reference(case)[index]
-    return tip_error(vsr.solve(paper.scene(case), reference.tau, model=vsr.Prescribed(basis)), reference)
+    return tip_error(
+        vsr.solve(paper.scene(case), reference.tau, model=vsr.Prescribed(basis)), reference
+    )
 
 
 @pytest.mark.parametrize("case", paper.CASES)
@@ -90,11 +93,14 @@ class TestClaims:
     def test_pcs_with_six_degrees_is_worse_than_three(self):
         assert paper.piecewise_basis().size == 6
         for i in range(4):
-            assert error_of("A2", i, paper.piecewise_basis()) > 10 * error_of("A2", i, paper.basis("A2"))
+            assert error_of("A2", i, paper.piecewise_basis()) > 10 * error_of(
+                "A2", i, paper.basis("A2")
+            )
 
 
 def test_helix_gradients_are_those_of_the_reference_method(helix):
-    """d tip / d radius and d tip / d angle of B1 at tau = -15 by central differences of the reference program."""
+    """d tip / d radius and d tip / d angle of B1 at tau = -15 by central differences of the
+    reference program."""
 
     def tip(scene, model):
         return vsr.solve(scene, jnp.array([-15.0]), model=model).tip[:3, 3]

@@ -7,8 +7,11 @@ import jax.numpy as jnp
 import pytest
 
 import vsr_jax as vsr
-from vsr_jax import cli, cli_common, optimize, paper, plausible, report
-from vsr_jax.scenefile import load_scene
+from vsr_jax.analysis import plausible
+from vsr_jax.cli import common as cli_common, main as cli, report
+from vsr_jax.files.scene_file import load
+from vsr_jax.optimization import design_search as optimize
+from vsr_jax.studies import paper
 
 FOLDER = pathlib.Path(__file__).parents[1] / "notebooks"
 SCENES = sorted((FOLDER / "scenes").glob("*.toml"))
@@ -16,8 +19,15 @@ HELIX = (FOLDER / "scenes" / "helix.toml").read_text()
 PARALLEL = 'type = "Parallel", y = 0.0, z = 0.0'
 
 
-def arm(*, length=0.3, radius=0.01, young=1e6, shear=3e5, density=1e3, guide_radius=0.02, area=1e-5):
-    rod = vsr.Rod(length, vsr.Circular(radius), vsr.Material(young, shear=shear, density=density), guide_radius=guide_radius)
+def arm(
+    *, length=0.3, radius=0.01, young=1e6, shear=3e5, density=1e3, guide_radius=0.02, area=1e-5
+):
+    rod = vsr.Rod(
+        length,
+        vsr.Circular(radius),
+        vsr.Material(young, shear=shear, density=density),
+        guide_radius=guide_radius,
+    )
     return vsr.Scene(rod, [vsr.Chamber(vsr.Parallel(0.0, 0.0), area)])
 
 
@@ -26,16 +36,45 @@ def arm(*, length=0.3, radius=0.01, young=1e6, shear=3e5, density=1e3, guide_rad
     [
         ({"length": 400.0}, "rod.length: 400 m; arms are 1 mm to 20 m long; is it in millimetres?"),
         ({"length": 1e9}, "rod.length: 1e+09 m; arms are 1 mm to 20 m long"),
-        ({"length": 200.0, "radius": 0.5}, "rod.length: 200 m; arms are 1 mm to 20 m long; is it in millimetres?"),
-        ({"radius": 7.0}, "rod.section: half thickness: 7 m; arms have 5 um to 0.5 m; is it in millimetres?"),
-        ({"guide_radius": 10.0}, "rod.guide_radius: 10 m; arms have 5 um to 0.5 m; is it in millimetres?"),
-        ({"radius": 0.2}, "rod: 1.5 times as long as half its thickness; rods are 3 to 10000 times; are length and sizes in one unit?"),
+        (
+            {"length": 200.0, "radius": 0.5},
+            "rod.length: 200 m; arms are 1 mm to 20 m long; is it in millimetres?",
+        ),
+        (
+            {"radius": 7.0},
+            "rod.section: half thickness: 7 m; arms have 5 um to 0.5 m; is it in millimetres?",
+        ),
+        (
+            {"guide_radius": 10.0},
+            "rod.guide_radius: 10 m; arms have 5 um to 0.5 m; is it in millimetres?",
+        ),
+        (
+            {"radius": 0.2},
+            "rod: 1.5 times as long as half its thickness; rods are 3 to 10000 times; are length "
+            "and sizes in one unit?",
+        ),
         ({"length": 19.0, "radius": 1e-4}, "rod: 1.9e+05 times as long as half its thickness"),
-        ({"young": 0.2}, "rod.material.young: 0.2 Pa; materials have 1 kPa to 2 TPa; is it in MPa or GPa?"),
-        ({"young": vsr.Taper(54.0, 60.0)}, "rod.material.young: 54 Pa; materials have 1 kPa to 2 TPa; is it in MPa or GPa?"),
-        ({"young": 54e9, "shear": 20e3}, "rod.material: young 5.4e+10 Pa and shear 20000 Pa; their ratio is 2 to 3"),
-        ({"density": 1.08}, "rod.material.density: 1.08 kg/m^3; materials have 50 to 25000 kg/m^3; is it in g/cm^3?"),
-        ({"area": 28.3}, "actuators[0].area: 28.3 m^2; the section has 0.00126 m^2; is it in mm^2?"),
+        (
+            {"young": 0.2},
+            "rod.material.young: 0.2 Pa; materials have 1 kPa to 2 TPa; is it in MPa or GPa?",
+        ),
+        (
+            {"young": vsr.Taper(54.0, 60.0)},
+            "rod.material.young: 54 Pa; materials have 1 kPa to 2 TPa; is it in MPa or GPa?",
+        ),
+        (
+            {"young": 54e9, "shear": 20e3},
+            "rod.material: young 5.4e+10 Pa and shear 20000 Pa; their ratio is 2 to 3",
+        ),
+        (
+            {"density": 1.08},
+            "rod.material.density: 1.08 kg/m^3; materials have 50 to 25000 kg/m^3; is it in "
+            "g/cm^3?",
+        ),
+        (
+            {"area": 28.3},
+            "actuators[0].area: 28.3 m^2; the section has 0.00126 m^2; is it in mm^2?",
+        ),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, dict) else "",
 )
@@ -47,7 +86,7 @@ def test_a_slip_of_unit_is_named(numbers, sentence):
 
 @pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
 def test_the_examples_are_plausible(path):
-    assert plausible.warnings_of(load_scene(path).scene) == ()
+    assert plausible.warnings_of(load(path).scene) == ()
 
 
 @pytest.mark.parametrize("case", ["A1", "B2", "C1"])
@@ -56,7 +95,11 @@ def test_the_papers_arms_are_plausible(case):
 
 
 def test_ordinary_arms_are_plausible():
-    for numbers in ({}, {"young": 5e4, "shear": 2e4}, {"length": 1.5, "radius": 3e-4, "young": 2e11, "shear": 8e10, "density": 7800.0}):
+    for numbers in (
+        {},
+        {"young": 5e4, "shear": 2e4},
+        {"length": 1.5, "radius": 3e-4, "young": 2e11, "shear": 8e10, "density": 7800.0},
+    ):
         assert plausible.warnings_of(arm(**numbers)) == ()
 
 
@@ -72,7 +115,11 @@ def test_large_strains_are_named_and_failed_or_traced_solves_are_not(helix):
     assert sentence.startswith("strain: up to 0.8; beyond 0.5 a linear material is doubtful")
     assert plausible.strain_warnings(solved(-2.0)) == ()
     said = []
-    jax.jit(lambda u: said.extend(plausible.strain_warnings(vsr.solve(soft, u, model=vsr.StrainDependent(4)))))(jnp.array([0.8 * stretch]))
+    jax.jit(
+        lambda u: said.extend(
+            plausible.strain_warnings(vsr.solve(soft, u, model=vsr.StrainDependent(4)))
+        )
+    )(jnp.array([0.8 * stretch]))
     jax.jit(lambda length: said.extend(plausible.warnings_of(arm(length=length))))(400.0)
     assert said == []
 
@@ -86,7 +133,11 @@ def test_the_health_of_a_solve_has_the_warnings(helix):
     assert report.health_record(health)["warnings"] == [sentence]
 
 
-@pytest.mark.parametrize("arguments", [["solve"], ["check"], ["sweep"], ["reach", "--target", "0.1", "0", "0"]], ids=lambda x: x[0])
+@pytest.mark.parametrize(
+    "arguments",
+    [["solve"], ["check"], ["sweep"], ["reach", "--target", "0.1", "0", "0"]],
+    ids=lambda x: x[0],
+)
 def test_commands_warn_on_stderr_before_they_begin(arguments, tmp_path, capsys):
     path = tmp_path / "arm.toml"
     path.write_text(HELIX.replace("length = 0.75", "length = 400"))
@@ -94,7 +145,10 @@ def test_commands_warn_on_stderr_before_they_begin(arguments, tmp_path, capsys):
     nowhere = ["--out" if name == "sweep" else "--json", str(tmp_path / "no" / "file")]
     assert cli.main([name, str(path), *more, *nowhere]) == cli_common.BAD_USAGE
     out, err = capsys.readouterr()
-    assert err.startswith("vsr-jax: warning: rod.length: 400 m; arms are 1 mm to 20 m long; is it in millimetres?\nvsr-jax: ")
+    assert err.startswith(
+        "vsr-jax: warning: rod.length: 400 m; arms are 1 mm to 20 m long; is it in "
+        "millimetres?\nvsr-jax: "
+    )
     assert out == ""
 
 
@@ -116,6 +170,10 @@ def test_design_warns_on_stderr_before_it_begins(tmp_path, capsys, monkeypatch):
 def test_solve_warns_of_large_strains(tmp_path, capsys):
     path = tmp_path / "arm.toml"
     free = 'free_strains = ["elongation"]\ninputs = [120.0]'
-    path.write_text(HELIX.replace("inputs = [-5.0]", free).replace('type = "Helix", radius = 0.005, angle = 1.529', PARALLEL))
+    path.write_text(
+        HELIX.replace("inputs = [-5.0]", free).replace(
+            'type = "Helix", radius = 0.005, angle = 1.529', PARALLEL
+        )
+    )
     assert cli.main(["solve", str(path), "--steps", "4"]) == cli_common.DONE
     assert capsys.readouterr().err.startswith("vsr-jax: warning: strain: up to 0.64; ")

@@ -1,4 +1,5 @@
-"""Pictures of designs, films, what is drawn onto arms; problems of design as files and the command that reads them."""
+"""Pictures of designs, films, what is drawn onto arms; problems of design as files and the command
+that reads them."""
 
 import json
 
@@ -8,9 +9,11 @@ import numpy as np
 import pytest
 
 import vsr_jax as vsr
-from vsr_jax import annotate, cli, cli_design, film, plot, plot_design
-from vsr_jax.designfile import load_design
-from vsr_jax.scenefile import load_scene
+from vsr_jax.cli import design_commands as cli_design, main as cli
+from vsr_jax.files.scene_file import load
+from vsr_jax.optimization.design_file import load_design
+from vsr_jax.viz import annotate, plot, plot_design
+from vsr_jax.viz.animation import film
 
 MODEL = vsr.StrainDependent(6)
 PROBLEM = """
@@ -18,7 +21,7 @@ title = "A thread to one place"
 inputs = [[2.0]]
 steps = 4
 starts = 2
-tried = 2
+candidates = 2
 
 [scene]
 free_strains = ["bending_z"]
@@ -55,7 +58,9 @@ wall = 0.001
 def eq():
     arm = vsr.Rod(0.3, vsr.Circular(0.01), vsr.Material(8e5, poisson=0.45, density=1000.0))
     loads = [vsr.Gravity(), vsr.TipWrench(force=(0.0, 0.0, 0.02), frame="body")]
-    return vsr.solve(vsr.Scene(arm, [vsr.Tendon(vsr.Parallel(0.005, 0.0))], loads), jnp.array([1.0]), model=MODEL)
+    return vsr.solve(
+        vsr.Scene(arm, [vsr.Tendon(vsr.Parallel(0.005, 0.0))], loads), jnp.array([1.0]), model=MODEL
+    )
 
 
 @pytest.fixture
@@ -89,31 +94,39 @@ def test_frames_and_loads_are_drawn_onto_an_arm(eq):
 
 
 def test_an_ellipsoid_has_the_size_it_says():
-    ax = annotate.ellipsoid(vsr.Ellipsoid(jnp.array([1.0, 0.0, 0.0]), jnp.diag(jnp.array([0.5, 0.2, 0.1]))), scale=2.0)
+    ax = annotate.ellipsoid(
+        vsr.Ellipsoid(jnp.array([1.0, 0.0, 0.0]), jnp.diag(jnp.array([0.5, 0.2, 0.1]))), scale=2.0
+    )
     np.testing.assert_allclose(ax.xy_dataLim.intervalx, (0.0, 2.0), atol=1e-3)
     np.testing.assert_allclose(ax.xy_dataLim.intervaly, (-0.4, 0.4), atol=1e-3)
 
 
 def test_a_film_has_a_frame_for_each_arm(eq, tmp_path):
-    moving = film.film([eq, eq, eq], tmp_path / "arm.gif", titles=["a", "b", "c"], seconds=1.0, dots=30)
+    moving = film([eq, eq, eq], tmp_path / "arm.gif", titles=["a", "b", "c"], seconds=1.0, dpi=30)
     assert moving is not None
     assert plt.imread(tmp_path / "arm.gif").ndim == 3
     with pytest.raises(ValueError, match="equilibria: got none"):
-        film.film([])
+        film([])
     with pytest.raises(ValueError, match="titles: got 1, need 2"):
-        film.film([eq, eq], titles=["a"])
+        film([eq, eq], titles=["a"])
 
 
 def test_a_problem_file_is_designed_kept_and_drawn(problem, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(cli_design, "hasten", lambda optimise: None)
-    out, record, picture = (tmp_path / name for name in ("designed.toml", "design.json", "design.png"))
-    code = cli.main(["design", str(problem), "--out", str(out), "--json", str(record), "--plot", str(picture)])
+    out, record, picture = (
+        tmp_path / name for name in ("designed.toml", "design.json", "design.png")
+    )
+    code = cli.main(
+        ["design", str(problem), "--out", str(out), "--json", str(record), "--plot", str(picture)]
+    )
     said = capsys.readouterr().out
     assert code == 0
     assert "Inside(wall=0.001): kept" in said
     assert "actuators[0].routing.y = " in said
-    kept, told = load_scene(out), json.loads(record.read_text())
-    assert float(kept.scene.actuators[0].routing.y) == pytest.approx(told["numbers"]["actuators[0].routing.y"])
+    kept, told = load(out), json.loads(record.read_text())
+    assert float(kept.scene.actuators[0].routing.y) == pytest.approx(
+        told["numbers"]["actuators[0].routing.y"]
+    )
     assert kept.inputs.tolist() == pytest.approx(told["inputs"][0])
     assert told["feasible"]
     assert len(told["starts"]) == 2
@@ -122,7 +135,9 @@ def test_a_problem_file_is_designed_kept_and_drawn(problem, tmp_path, capsys, mo
 
 def test_a_history_marks_the_one_that_was_chosen(problem):
     task = load_design(problem)
-    found = vsr.design(task.scene, task.free, task.objective, task.inputs, progress=False, **task.settings)
+    found = vsr.design(
+        task.scene, task.free, task.objective, task.inputs, progress=False, **task.settings
+    )
     lines = plot_design.history(found).get_lines()
     assert [line.get_label() for line in lines][-1] == "chosen"
     assert np.nanmin(lines[-1].get_ydata()) == pytest.approx(found.objective)
@@ -132,7 +147,11 @@ def test_a_history_marks_the_one_that_was_chosen(problem):
     ("old", "new", "message"),
     [
         ("[free]", "[fre]", "unknown key 'fre'"),
-        ('type = "TipError"', 'type = "TipEror"', r"objectives\[0\]: unknown type 'TipEror'.*did you mean 'TipError'"),
+        (
+            'type = "TipError"',
+            'type = "TipEror"',
+            r"objectives\[0\]: unknown type 'TipEror'.*did you mean 'TipError'",
+        ),
         ("wall = 0.001", "wal = 0.001", r"constraints\[0\]: unknown key 'wal'"),
         ("wall = 0.001", "wall = -1.0", r"constraints\[0\]: Inside.wall: got -1"),
         ("young = 8e5", "young = -8e5", "young"),
@@ -148,4 +167,6 @@ def test_errors_of_problem_files_name_file_and_place(unchecked, problem, old, ne
 def test_what_the_command_refuses_is_one_line(problem, capsys):
     problem.write_text(PROBLEM.replace("[0.001, 0.009]", "[0.009, 0.001]"))
     assert cli.main(["design", str(problem)]) == 2
-    assert capsys.readouterr().err.startswith("vsr-jax: free['actuators[0].routing.y']: got [0.009, 0.001], need the least value first")
+    assert capsys.readouterr().err.startswith(
+        "vsr-jax: free['actuators[0].routing.y']: got [0.009, 0.001], need the least value first"
+    )

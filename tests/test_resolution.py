@@ -1,4 +1,5 @@
-"""Steps too few for a shape: told from the shape itself, over random threads and steps of every order."""
+"""Steps too few for a shape: told from the shape itself, over random threads and steps of every
+order."""
 
 import math
 
@@ -8,19 +9,26 @@ import numpy as np
 import pytest
 
 import vsr_jax as vsr
-from vsr_jax.resolution import COARSE
+from vsr_jax.mechanics.resolution import COARSE
 
 LENGTH = 0.3
 
 
 def tip_of(order, steps):
-    """Tip [1/L] and status of an arm with a helix and a parallel thread, its taper, turns and tensions given, one of a batch."""
+    """Tip [1/L] and status of an arm with a helix and a parallel thread, its taper, turns and
+    tensions given, one of a batch."""
     model = vsr.StrainDependent(steps, order)
 
     def tip(taper, turns, tensions):
-        rod = vsr.Rod(LENGTH, vsr.Circular(vsr.Taper(0.01, 0.01 * taper)), vsr.Material(1e6, poisson=0.45))
+        rod = vsr.Rod(
+            LENGTH, vsr.Circular(vsr.Taper(0.01, 0.01 * taper)), vsr.Material(1e6, poisson=0.45)
+        )
         helix = vsr.Helix(0.002, pitch=LENGTH / turns)
-        eq = vsr.solve(vsr.Scene(rod, [vsr.Tendon(helix), vsr.Tendon(vsr.Parallel(0.0, 0.002))]), tensions, model=model)
+        eq = vsr.solve(
+            vsr.Scene(rod, [vsr.Tendon(helix), vsr.Tendon(vsr.Parallel(0.0, 0.002))]),
+            tensions,
+            model=model,
+        )
         return eq.tip[:3, 3] / LENGTH, eq.status
 
     return jax.jit(jax.vmap(tip))
@@ -30,7 +38,11 @@ def tip_of(order, steps):
 def draws():
     random = np.random.default_rng(1)
     turns = np.exp(random.uniform(math.log(0.3), math.log(60), 300))
-    return random.uniform(0.4, 1, 300), turns, np.exp(random.uniform(math.log(0.05), math.log(20), (300, 2)))
+    return (
+        random.uniform(0.4, 1, 300),
+        turns,
+        np.exp(random.uniform(math.log(0.05), math.log(20), (300, 2))),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -40,9 +52,12 @@ def exact(draws):
     return np.asarray(tip)
 
 
-@pytest.mark.parametrize(("order", "steps", "largest"), [(2, 32, 0.05), (4, 16, 0.06), (6, 8, 0.05), (6, 32, 0.02)])
+@pytest.mark.parametrize(
+    ("order", "steps", "largest"), [(2, 32, 0.05), (4, 16, 0.06), (6, 8, 0.05), (6, 32, 0.02)]
+)
 def test_what_converges_is_resolved(order, steps, largest, draws, exact):
-    """The largest error allowed, as a share of the length; and what is refused is threads that turn fast."""
+    """The largest error allowed, as a share of the length; and what is refused is threads that turn
+    fast."""
     tip, status = map(np.asarray, tip_of(order, steps)(*draws))
     kept = status == vsr.Status.CONVERGED
     assert set(status) <= {vsr.Status.CONVERGED, vsr.Status.UNDER_RESOLVED}
@@ -56,7 +71,9 @@ def test_what_converges_is_resolved(order, steps, largest, draws, exact):
 @pytest.mark.parametrize("order", [2, 4, 6])
 def test_no_choice_of_nodes_hides_a_wave(order):
     """With a whole turn from node to node, or nearly, the strain looks slow."""
-    tip, status = tip_of(order, 16)(np.array([1.0]), np.array([8.0 * order]), np.array([[10.0, 0.0]]))
+    tip, status = tip_of(order, 16)(
+        np.array([1.0]), np.array([8.0 * order]), np.array([[10.0, 0.0]])
+    )
     assert status[0] == vsr.Status.UNDER_RESOLVED
     assert np.all(np.isnan(tip))
 
@@ -66,10 +83,14 @@ def test_a_weak_wave_does_not_matter():
     assert status[0] == vsr.Status.CONVERGED
 
 
-@pytest.mark.parametrize("model", [vsr.Prescribed(vsr.Basis.uniform(vsr.Legendre(2)), steps=4), vsr.Continuum()])
+@pytest.mark.parametrize(
+    "model", [vsr.Prescribed(vsr.Basis.uniform(vsr.Legendre(2)), steps=4), vsr.Continuum()]
+)
 def test_other_models(model):
     """Steps of a smooth basis resolve it; the continuum model chooses its own."""
     rod = vsr.Rod(LENGTH, vsr.Circular(0.01), vsr.Material(1e6, poisson=0.45))
-    eq = vsr.solve(vsr.Scene(rod, [vsr.Thread(vsr.Parallel(0.0, 0.005))]), jnp.array([-5.0]), model=model)
+    eq = vsr.solve(
+        vsr.Scene(rod, [vsr.Thread(vsr.Parallel(0.0, 0.005))]), jnp.array([-5.0]), model=model
+    )
     assert eq.status == vsr.Status.CONVERGED
     assert eq.model.finer() != eq.model

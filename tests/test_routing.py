@@ -32,7 +32,9 @@ def test_helix_by_angle_is_eq_23(hand, sign):
     pitch = 2 * np.pi * 0.005 * np.tan(1.5)
     phi = 0.3 + sign * 2 * np.pi * X / pitch
     np.testing.assert_allclose(p.y, 0.005 * np.cos(phi), atol=1e-15)
-    np.testing.assert_allclose(p.slope_z, sign * 0.005 * 2 * np.pi / pitch * np.cos(phi), atol=1e-14)
+    np.testing.assert_allclose(
+        p.slope_z, sign * 0.005 * 2 * np.pi / pitch * np.cos(phi), atol=1e-14
+    )
 
 
 def test_helix_by_pitch_is_the_helix_by_angle():
@@ -79,12 +81,21 @@ def test_function_takes_parameters_that_can_be_differentiated():
     ("make", "message"),
     [
         (lambda: vsr.Helix(0.005), "Helix: got angle=None and pitch=None, need one of the two"),
-        (lambda: vsr.Helix(0.005, 87.6), r"Helix\.angle: got 87\.6, need a finite number > 0 and <= 1\.5708"),
+        (
+            lambda: vsr.Helix(0.005, 87.6),
+            r"Helix\.angle: got 87\.6, need a finite number > 0 and <= 1\.5708",
+        ),
         (lambda: vsr.Helix(0.0, 1.5), r"Helix\.radius: got 0\.0, need a finite number > 0"),
-        (lambda: vsr.Helix(0.005, 1.5, hand="up"), r"Helix\.hand: got 'up', need one of 'right', 'left'"),
+        (
+            lambda: vsr.Helix(0.005, 1.5, hand="up"),
+            r"Helix\.hand: got 'up', need one of 'right', 'left'",
+        ),
         (lambda: vsr.Linear("a", 0.0), r"Linear\.y: got 'a', need a finite number"),
         (lambda: vsr.Parallel(np.nan, 0.0), r"Parallel\.y: got nan, need a finite number"),
-        (lambda: vsr.Parallel([0.1, 0.2], 0.0), r"Parallel\.y: got shape \(2,\), need a finite number"),
+        (
+            lambda: vsr.Parallel([0.1, 0.2], 0.0),
+            r"Parallel\.y: got shape \(2,\), need a finite number",
+        ),
         (lambda: vsr.Spline([0.0, 0.5, 0.4], np.zeros(3), np.zeros(3)), "need rising abscissas"),
         (lambda: vsr.Spline([0.0, 0.5], np.zeros(3), np.zeros(2)), r"Spline\.y: got shape \(3,\)"),
         (lambda: vsr.Polynomial([], [0.0]), "need at least one number"),

@@ -6,11 +6,16 @@ import numpy as np
 import pytest
 
 import vsr_jax as vsr
-from vsr_jax import se3
+from vsr_jax.numerics import se3
 
 ARM = vsr.Rod(0.5, vsr.Circular(0.01), vsr.Material(1e6, poisson=0.5))
 SCENE = vsr.Scene(
-    ARM, [vsr.Tendon(vsr.Parallel(0.005, 0.0)), vsr.Chamber(vsr.Parallel(0.0, 0.005), area=2e-5), vsr.Thread(vsr.Parallel(0.0, -0.005))]
+    ARM,
+    [
+        vsr.Tendon(vsr.Parallel(0.005, 0.0)),
+        vsr.Chamber(vsr.Parallel(0.0, 0.005), area=2e-5),
+        vsr.Thread(vsr.Parallel(0.0, -0.005)),
+    ],
 )
 
 
@@ -21,7 +26,10 @@ def test_inputs_become_thread_forces():
 @pytest.mark.parametrize(
     ("inputs", "message"),
     [
-        ([1.0, 2.0], r"inputs: got shape \(2,\), need \(3,\), one number each for Tendon, Chamber, Thread"),
+        (
+            [1.0, 2.0],
+            r"inputs: got shape \(2,\), need \(3,\), one number each for Tendon, Chamber, Thread",
+        ),
         (np.ones((4, 3)), "for a batch use jax.vmap"),
         ([-1.0, 0.0, 0.0], r"inputs\[0\]: got -1, need a finite number >= 0 \[N\] for a Tendon"),
         ([1.0, np.nan, 0.0], r"inputs\[1\]: got nan, need a finite number \[Pa\] for a Chamber"),
@@ -41,14 +49,19 @@ def test_traced_inputs_get_a_status_instead():
         return vsr.solve(SCENE, inputs).status
 
     rows = jnp.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [1.0, jnp.nan, 0.0]])
-    np.testing.assert_array_equal(jax.vmap(status)(rows), [vsr.Status.CONVERGED, vsr.Status.INADMISSIBLE, vsr.Status.NOT_FINITE])
+    np.testing.assert_array_equal(
+        jax.vmap(status)(rows),
+        [vsr.Status.CONVERGED, vsr.Status.INADMISSIBLE, vsr.Status.NOT_FINITE],
+    )
 
 
 def test_throw_raises_with_the_status_in_words():
     with pytest.raises(vsr.SolveError, match="collapsed"):
         vsr.solve(SCENE, [1e4, 0.0, 0.0], throw=True)
     with pytest.raises(RuntimeError, match="collapsed"):
-        jax.block_until_ready(jax.jit(lambda x: vsr.solve(SCENE, x, throw=True).tip)(jnp.array([1e4, 0.0, 0.0])))
+        jax.block_until_ready(
+            jax.jit(lambda x: vsr.solve(SCENE, x, throw=True).tip)(jnp.array([1e4, 0.0, 0.0]))
+        )
 
 
 @pytest.mark.parametrize(
@@ -58,17 +71,35 @@ def test_throw_raises_with_the_status_in_words():
             lambda: vsr.Scene(ARM, [vsr.Thread(vsr.Parallel(0.02, 0.0))]),
             r"actuators\[0\]\.routing: the thread lies 0\.01 m outside the section",
         ),
-        (lambda: vsr.Scene(ARM, [vsr.Thread(vsr.Linear(0.0, 0.0, 0.1))]), r"0\.04 m outside the section at X = 0\.5 m"),
-        (lambda: vsr.Scene(ARM, [vsr.Parallel(0.0, 0.0)]), r"Scene\.actuators\[0\]: got .*, need a Thread, Tendon or Chamber"),
+        (
+            lambda: vsr.Scene(ARM, [vsr.Thread(vsr.Linear(0.0, 0.0, 0.1))]),
+            r"0\.04 m outside the section at X = 0\.5 m",
+        ),
+        (
+            lambda: vsr.Scene(ARM, [vsr.Parallel(0.0, 0.0)]),
+            r"Scene\.actuators\[0\]: got .*, need a Thread, Tendon or Chamber",
+        ),
         (lambda: vsr.Scene("arm", []), "Scene.rod: got 'arm', need a Rod"),
         (lambda: vsr.Thread(0.005), r"Thread\.routing: got 0\.005, need a routing"),
         (lambda: vsr.Chamber(vsr.Parallel(0.0, 0.0), area=0.0), r"Chamber\.area: got 0\.0"),
         (lambda: vsr.solve("scene", []), "scene: got 'scene', need a Scene"),
-        (lambda: vsr.solve(SCENE, [0.0, 0.0, 0.0], model="exact"), "model: got 'exact', need StrainDependent"),
-        (lambda: vsr.StrainDependent(order=3), r"StrainDependent\.order: got 3, need one of 2, 4, 6"),
-        (lambda: vsr.StrainDependent(steps=0), r"StrainDependent\.steps: got 0, need an integer >= 1"),
+        (
+            lambda: vsr.solve(SCENE, [0.0, 0.0, 0.0], model="exact"),
+            "model: got 'exact', need StrainDependent",
+        ),
+        (
+            lambda: vsr.StrainDependent(order=3),
+            r"StrainDependent\.order: got 3, need one of 2, 4, 6",
+        ),
+        (
+            lambda: vsr.StrainDependent(steps=0),
+            r"StrainDependent\.steps: got 0, need an integer >= 1",
+        ),
         (lambda: vsr.Prescribed(3), r"Prescribed\.basis: got 3, need a basis"),
-        (lambda: vsr.Continuum(solver="rk4"), r"Continuum\.solver: got 'rk4', need a diffrax solver"),
+        (
+            lambda: vsr.Continuum(solver="rk4"),
+            r"Continuum\.solver: got 'rk4', need a diffrax solver",
+        ),
         (lambda: vsr.solve(SCENE, [0.0, 0.0, 0.0]).pose(np.zeros((2, 2))), "X: got shape"),
     ],
 )
@@ -79,8 +110,13 @@ def test_refusals_say_what_and_where(make, message):
 
 
 def test_a_size_that_vanishes_somewhere_is_refused():
-    arm = vsr.Rod(0.5, vsr.Circular(vsr.PolynomialProfile([0.01, -0.03])), vsr.Material(1e6, poisson=0.5))
-    with pytest.raises(ValueError, match=r"section\.radius: got -0\.005 m at X = 0\.5 m, need a size > 0 everywhere"):
+    arm = vsr.Rod(
+        0.5, vsr.Circular(vsr.PolynomialProfile([0.01, -0.03])), vsr.Material(1e6, poisson=0.5)
+    )
+    with pytest.raises(
+        ValueError,
+        match=r"section\.radius: got -0\.005 m at X = 0\.5 m, need a size > 0 everywhere",
+    ):
         vsr.Scene(arm, [])
 
 
@@ -90,16 +126,49 @@ TUBE = vsr.Annular(vsr.Taper(0.02, 0.01), 0.015)
 @pytest.mark.parametrize(
     ("section", "material", "rest", "message"),
     [
-        (TUBE, {}, None, r"rod\.section\.inner: got 0\.015 m at X = 0\.5 m, need less than the outer radius everywhere"),
-        (vsr.Joined([0.2], [vsr.Circular(0.02), TUBE]), {}, None, r"rod\.section\.sections\[1\]\.inner: got 0\.015 m at X = 0\.5 m"),
-        (None, {"poisson": lambda x: 0.4 + x}, None, r"rod\.material\.poisson: got 0\.9 at X = 0\.5 m, need a ratio > -1 and <= 0\.5"),
-        (None, {"young": lambda x: 1e6 - 4e6 * x}, None, r"rod\.material\.young: got -1e\+06 at X = 0\.5 m, need a number > 0"),
-        (None, {"density": lambda x: 1e3 - 4e3 * x}, None, r"rod\.material\.density: got -1000 at X = 0\.5 m"),
-        (None, {}, (0.0, 0.0, 4.0, 0.0, 0.0, 0.0), r"rod\.rest_strain \(elongation\): got 0 at X = 0 m, need a number > 0"),
+        (
+            TUBE,
+            {},
+            None,
+            r"rod\.section\.inner: got 0\.015 m at X = 0\.5 m, need less than the outer radius "
+            r"everywhere",
+        ),
+        (
+            vsr.Joined([0.2], [vsr.Circular(0.02), TUBE]),
+            {},
+            None,
+            r"rod\.section\.sections\[1\]\.inner: got 0\.015 m at X = 0\.5 m",
+        ),
+        (
+            None,
+            {"poisson": lambda x: 0.4 + x},
+            None,
+            r"rod\.material\.poisson: got 0\.9 at X = 0\.5 m, need a ratio > -1 and <= 0\.5",
+        ),
+        (
+            None,
+            {"young": lambda x: 1e6 - 4e6 * x},
+            None,
+            r"rod\.material\.young: got -1e\+06 at X = 0\.5 m, need a number > 0",
+        ),
+        (
+            None,
+            {"density": lambda x: 1e3 - 4e3 * x},
+            None,
+            r"rod\.material\.density: got -1000 at X = 0\.5 m",
+        ),
+        (
+            None,
+            {},
+            (0.0, 0.0, 4.0, 0.0, 0.0, 0.0),
+            r"rod\.rest_strain \(elongation\): got 0 at X = 0 m, need a number > 0",
+        ),
     ],
     ids=["tube", "joined tube", "poisson", "young", "density", "elongation"],
 )
-def test_numbers_of_the_rod_out_of_their_range_somewhere_are_refused(section, material, rest, message):
+def test_numbers_of_the_rod_out_of_their_range_somewhere_are_refused(
+    section, material, rest, message
+):
     numbers = {"young": 1e6, "poisson": 0.5, **material}
     arm = vsr.Rod(0.5, section or vsr.Circular(0.02), vsr.Material(**numbers), rest_strain=rest)
     with pytest.raises(ValueError, match=message):
@@ -111,7 +180,11 @@ def test_a_section_keeps_to_its_limits_where_it_is_laid():
     vsr.Scene(vsr.Rod(0.5, joined, vsr.Material(1e6, poisson=0.5)))
 
 
-BENT = vsr.Scene(ARM, [vsr.Tendon(vsr.Parallel(0.005, 0.0), start=0.1, end=0.3)], [vsr.TipWrench(force=(0.0, 0.1, 0.0))])
+BENT = vsr.Scene(
+    ARM,
+    [vsr.Tendon(vsr.Parallel(0.005, 0.0), start=0.1, end=0.3)],
+    [vsr.TipWrench(force=(0.0, 0.1, 0.0))],
+)
 STEPS = vsr.StrainDependent(8)
 
 
@@ -120,10 +193,14 @@ def bent():
     return vsr.solve(BENT, [1.0], model=STEPS)
 
 
-@pytest.mark.parametrize("X", [0.7, -0.1, [0.1, 0.7], np.nan], ids=["beyond", "before", "one of two", "nan"])
+@pytest.mark.parametrize(
+    "X", [0.7, -0.1, [0.1, 0.7], np.nan], ids=["beyond", "before", "one of two", "nan"]
+)
 @pytest.mark.parametrize("quantity", ["pose", "position", "strain", "reaction"])
 def test_places_beyond_the_arm_are_refused(bent, quantity, X):
-    with pytest.raises(ValueError, match=r"X: got (0\.7|-0\.1|nan) m, need 0 to 0\.5 m, the ends of the arm"):
+    with pytest.raises(
+        ValueError, match=r"X: got (0\.7|-0\.1|nan) m, need 0 to 0\.5 m, the ends of the arm"
+    ):
         getattr(bent, quantity)(X)
 
 
@@ -155,19 +232,28 @@ def test_discs_may_guide_threads_outside_the_section():
     arm = vsr.Rod(0.4, vsr.Circular(0.0007), vsr.Material(54e9, poisson=0.3), guide_radius=0.012)
     eq = vsr.solve(vsr.Scene(arm, [vsr.Tendon(vsr.Parallel(0.01, 0.0))]), [2.0])
     EA, EI = 54e9 * np.pi * 0.0007**2, 54e9 * np.pi / 4 * 0.0007**4
-    np.testing.assert_allclose(eq.strain(0.2), [0, 0, 0.02 / EI, 1 - 2 / EA, 0, 0], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(
+        eq.strain(0.2), [0, 0, 0.02 / EI, 1 - 2 / EA, 0, 0], rtol=1e-9, atol=1e-9
+    )
 
 
 def test_base_and_rest_strain_place_the_arm_at_rest():
     base = se3.exp(jnp.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0]))
     rest = (0.0, 0.0, 4.0, 1.0, 0.0, 0.0)
-    arm = vsr.Rod(0.5, vsr.Circular(0.01), vsr.Material(1e6, poisson=0.5), rest_strain=rest, base=base)
+    arm = vsr.Rod(
+        0.5, vsr.Circular(0.01), vsr.Material(1e6, poisson=0.5), rest_strain=rest, base=base
+    )
     eq = vsr.solve(vsr.Scene(arm, [vsr.Thread(vsr.Parallel(0.005, 0.0))]), [0.0])
     np.testing.assert_allclose(eq.tip, base @ se3.exp(0.5 * jnp.asarray(rest)), atol=1e-12)
 
 
 def test_rest_strain_may_be_a_function_of_X():
-    arm = vsr.Rod(0.5, vsr.Circular(0.01), vsr.Material(1e6, poisson=0.5), rest_strain=lambda x: (0.0, 0.0, 8 * x, 1.0, 0.0, 0.0))
+    arm = vsr.Rod(
+        0.5,
+        vsr.Circular(0.01),
+        vsr.Material(1e6, poisson=0.5),
+        rest_strain=lambda x: (0.0, 0.0, 8 * x, 1.0, 0.0, 0.0),
+    )
     eq = vsr.solve(vsr.Scene(arm, [vsr.Thread(vsr.Parallel(0.005, 0.0))]), [0.0])
     turn = np.arctan2(eq.tip[1, 0], eq.tip[0, 0])
     np.testing.assert_allclose(turn, 8 * 0.5**2 / 2, rtol=1e-12)

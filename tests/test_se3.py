@@ -1,4 +1,5 @@
-"""SE(3): the maps against their definitions and the exponential's derivatives against extended precision."""
+"""SE(3): the maps against their definitions and the exponential's derivatives against extended
+precision."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import epsilon
-from vsr_jax import se3
+from vsr_jax.numerics import se3
 
 AXIS = np.array([1.0, 2.0, 2.0]) / 3
 ANGLES = (0.0, 1e-12, 1e-8, 1e-4, 1e-2, 0.5, 1.0, 1.99, 2.01, 3.0, np.pi, 6.0)
@@ -19,8 +20,9 @@ def twist(seed=0):
 def exact_derivatives(omega, directions):
     """exp and its first three derivatives along `directions`, in extended precision.
 
-    The exponential of a matrix over the algebra of three dual numbers e1, e2, e3 (each squares to zero) holds the mixed
-    derivatives as its coefficients; represent the algebra by 8 x 8 nilpotent matrices and sum the power series.
+    The exponential of a matrix over the algebra of three dual numbers e1, e2, e3 (each squares to
+    zero) holds the mixed derivatives as its coefficients; represent the algebra by 8 x 8 nilpotent
+    matrices and sum the power series.
     """
 
     def hat(xi):
@@ -60,15 +62,21 @@ def test_exp_and_three_derivatives_are_exact_to_rounding(angle, dtype):
     for _ in range(4):
         directions = rng.normal(size=(3, 6)).astype(dtype)
         exact = exact_derivatives(omega.astype(np.longdouble), directions.astype(np.longdouble))
-        for order, (got, want) in enumerate(zip(computed_derivatives(omega, *directions), exact, strict=True)):
+        for order, (got, want) in enumerate(
+            zip(computed_derivatives(omega, *directions), exact, strict=True)
+        ):
             error = np.abs(np.asarray(got, np.longdouble) - want).max() / max(1, np.abs(want).max())
             assert got.dtype == dtype
-            assert error <= 32 * epsilon(dtype), f"derivative {order} is off by {error / epsilon(dtype):.0f} eps"
+            assert error <= 32 * epsilon(dtype), (
+                f"derivative {order} is off by {error / epsilon(dtype):.0f} eps"
+            )
 
 
 def test_reverse_mode_agrees_with_forward_at_the_identity(dtype):
     omega = jnp.asarray([0, 0, 0, 1, 0, 0], dtype)
-    np.testing.assert_allclose(jax.jacrev(se3.exp)(omega), jax.jacfwd(se3.exp)(omega), atol=4 * epsilon(dtype))
+    np.testing.assert_allclose(
+        jax.jacrev(se3.exp)(omega), jax.jacfwd(se3.exp)(omega), atol=4 * epsilon(dtype)
+    )
 
 
 def test_exp_is_a_rigid_motion_and_inverts():
@@ -84,7 +92,9 @@ def test_vee_inverts_hat():
 
 def test_adjoint_is_conjugation():
     g, xi = se3.exp(twist(1)), twist(2)
-    np.testing.assert_allclose(se3.hat(se3.adjoint(g) @ xi), g @ se3.hat(xi) @ se3.inverse(g), atol=1e-14)
+    np.testing.assert_allclose(
+        se3.hat(se3.adjoint(g) @ xi), g @ se3.hat(xi) @ se3.inverse(g), atol=1e-14
+    )
 
 
 def test_ad_is_the_bracket():
@@ -112,18 +122,25 @@ def test_maps_of_a_batch_by_vmap():
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-3, 1.0, 2.0, 2.2, 3.0, 3.14159, np.pi])
 def test_rotation_vectors_are_those_of_the_exponential(angle):
-    """Half a turn included, where the skew part of the rotation is nothing: it was taken for no turn at all."""
+    """Half a turn included, where the skew part of the rotation is nothing: it was taken for no
+    turn at all."""
     for axis in np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, -1], [0.6, -0.8, 0], [0.48, 0.6, 0.64]]):
         rotation = se3.exp(jnp.append(jnp.asarray(angle * axis), jnp.zeros(3)))[:3, :3]
         found = np.asarray(se3.rotation_vector(rotation))
         sign = np.sign(found @ axis) if angle == np.pi else 1.0
-        np.testing.assert_allclose(sign * found, angle * axis, atol=1e-12 * max(angle, 1e-3) + 1e-15)
+        np.testing.assert_allclose(
+            sign * found, angle * axis, atol=1e-12 * max(angle, 1e-3) + 1e-15
+        )
     exact = np.diag([1.0, -1.0, -1.0])
-    np.testing.assert_allclose(np.abs(se3.rotation_vector(jnp.asarray(exact))), [np.pi, 0, 0], atol=1e-15)
+    np.testing.assert_allclose(
+        np.abs(se3.rotation_vector(jnp.asarray(exact))), [np.pi, 0, 0], atol=1e-15
+    )
 
 
 def test_rotation_vectors_have_derivatives_up_to_half_a_turn():
     for angle in (0.0, 0.5, 2.0, 2.2, 3.1, 3.14):
         at = jnp.array([0.48, 0.6, 0.64]) * angle
-        slope = jax.jacfwd(lambda k: se3.rotation_vector(se3.exp(jnp.append(k, jnp.zeros(3)))[:3, :3]))(at)
+        slope = jax.jacfwd(
+            lambda k: se3.rotation_vector(se3.exp(jnp.append(k, jnp.zeros(3)))[:3, :3])
+        )(at)
         np.testing.assert_allclose(slope, np.eye(3), atol=1e-10)

@@ -23,21 +23,38 @@ def based(base):
 def test_circle():
     shape = geometry(vsr.Circular(vsr.Taper(0.012, 0.010)))
     r = 0.012 - 0.002 * 0.4
-    np.testing.assert_allclose([shape.area, shape.moment_y, shape.torsion], [np.pi * r**2, np.pi * r**4 / 4, np.pi * r**4 / 2], rtol=1e-14)
+    np.testing.assert_allclose(
+        [shape.area, shape.moment_y, shape.torsion],
+        [np.pi * r**2, np.pi * r**4 / 4, np.pi * r**4 / 2],
+        rtol=1e-14,
+    )
 
 
 def test_tube_is_the_difference_of_two_circles():
-    tube, outer, inner = (geometry(s) for s in (vsr.Annular(0.02, 0.015), vsr.Circular(0.02), vsr.Circular(0.015)))
-    for a, b, c in zip(jax.tree.leaves(tube)[:4], jax.tree.leaves(outer)[:4], jax.tree.leaves(inner)[:4], strict=True):
+    tube, outer, inner = (
+        geometry(s) for s in (vsr.Annular(0.02, 0.015), vsr.Circular(0.02), vsr.Circular(0.015))
+    )
+    for a, b, c in zip(
+        jax.tree.leaves(tube)[:4],
+        jax.tree.leaves(outer)[:4],
+        jax.tree.leaves(inner)[:4],
+        strict=True,
+    ):
         np.testing.assert_allclose(a, b - c, rtol=1e-14)
 
 
-@pytest.mark.parametrize(("ratio", "constant"), [(1.0, 0.1406), (1.5, 0.1958), (2.0, 0.2287), (3.0, 0.2633), (10.0, 0.3123)])
+@pytest.mark.parametrize(
+    ("ratio", "constant"),
+    [(1.0, 0.1406), (1.5, 0.1958), (2.0, 0.2287), (3.0, 0.2633), (10.0, 0.3123)],
+)
 def test_rectangle_torsion_is_the_published_table(ratio, constant):
-    """J = k1 a b^3. Timoshenko and Goodier, Theory of Elasticity, 3rd ed., art. 109, table 11 (k1)."""
+    """J = k1 a b^3. Timoshenko and Goodier, Theory of Elasticity, 3rd ed., art. 109, table 11
+    (k1)."""
     for w, h in ((ratio * 0.01, 0.01), (0.01, ratio * 0.01)):
         J = geometry(vsr.Rectangular(w, h)).torsion
-        np.testing.assert_allclose(J / (ratio * 0.01**4), constant, atol=6e-5 if ratio < 10 else 1.1e-4)
+        np.testing.assert_allclose(
+            J / (ratio * 0.01**4), constant, atol=6e-5 if ratio < 10 else 1.1e-4
+        )
 
 
 def test_square_torsion_to_rounding():
@@ -57,8 +74,12 @@ def test_rectangle_torsion_has_no_kink_at_the_square():
 
 def test_ellipse_and_its_choice_of_torsion():
     a, b = 0.02, 0.01
-    saint_venant, polar = (geometry(vsr.Elliptic(a, b, torsion=t)) for t in ("saint_venant", "polar"))
-    np.testing.assert_allclose(saint_venant.torsion, np.pi * a**3 * b**3 / (a**2 + b**2), rtol=1e-14)
+    saint_venant, polar = (
+        geometry(vsr.Elliptic(a, b, torsion=t)) for t in ("saint_venant", "polar")
+    )
+    np.testing.assert_allclose(
+        saint_venant.torsion, np.pi * a**3 * b**3 / (a**2 + b**2), rtol=1e-14
+    )
     np.testing.assert_allclose(polar.torsion, np.pi / 4 * (a * b**3 + a**3 * b), rtol=1e-14)
     np.testing.assert_allclose(saint_venant.moment_z, np.pi / 4 * a**3 * b, rtol=1e-14)
 
@@ -66,7 +87,14 @@ def test_ellipse_and_its_choice_of_torsion():
 def test_stiffness_order_and_shear_correction():
     section = vsr.Rectangular(0.02, 0.01, shear_correction=(0.5, 0.8))
     E, G, shape = 2e11, 2e11 / 2.6, geometry(section)
-    want = [G * shape.torsion, E * 0.02 * 0.01**3 / 12, E * 0.01 * 0.02**3 / 12, E * 2e-4, 0.5 * G * 2e-4, 0.8 * G * 2e-4]
+    want = [
+        G * shape.torsion,
+        E * 0.02 * 0.01**3 / 12,
+        E * 0.01 * 0.02**3 / 12,
+        E * 2e-4,
+        0.5 * G * 2e-4,
+        0.8 * G * 2e-4,
+    ]
     np.testing.assert_allclose(STEEL.stiffness(section, X, L), want, rtol=1e-13)
 
 
@@ -90,10 +118,15 @@ SECTIONS = {
 def test_clearance_on_the_axis_has_finite_derivatives(name):
     section, guided = SECTIONS[name], vsr.Rod(L, SECTIONS[name], STEEL, guide_radius=0.05)
     zero = jnp.zeros(())
-    for clearance, expected in ((lambda y, z: section.clearance(y, z, X, L), 0.01), (lambda y, z: guided.clearance(y, z, X), 0.05)):
+    for clearance, expected in (
+        (lambda y, z: section.clearance(y, z, X, L), 0.01),
+        (lambda y, z: guided.clearance(y, z, X), 0.05),
+    ):
         value, slope = jax.value_and_grad(clearance, argnums=(0, 1))(zero, zero)
         np.testing.assert_allclose(value, expected, rtol=1e-12)
-        assert np.all(np.abs(slope) <= (1.0 if name == "rectangle" else 0.0))  # of the kink the slope of one side
+        assert np.all(
+            np.abs(slope) <= (1.0 if name == "rectangle" else 0.0)
+        )  # of the kink the slope of one side
         assert np.all(np.isfinite(jax.hessian(clearance, argnums=(0, 1))(zero, zero)))
 
 
@@ -107,11 +140,15 @@ def test_profiles():
     ]
     for profile, want in cases:
         np.testing.assert_allclose(profile(X, L), want, rtol=1e-13)
-        np.testing.assert_allclose(geometry(vsr.Circular(profile)).area, np.pi * want**2, rtol=1e-12)
+        np.testing.assert_allclose(
+            geometry(vsr.Circular(profile)).area, np.pi * want**2, rtol=1e-12
+        )
 
 
 def test_a_python_function_is_a_profile():
-    np.testing.assert_allclose(geometry(vsr.Circular(lambda x: 0.01 - 0.01 * x)).area, np.pi * 0.007**2, rtol=1e-13)
+    np.testing.assert_allclose(
+        geometry(vsr.Circular(lambda x: 0.01 - 0.01 * x)).area, np.pi * 0.007**2, rtol=1e-13
+    )
 
 
 @pytest.mark.parametrize(
@@ -122,30 +159,69 @@ def test_a_python_function_is_a_profile():
         (lambda: vsr.Circular("thick"), r"Circular\.radius: got 'thick'"),
         (lambda: vsr.Circular(np.inf), r"Circular\.radius: got inf"),
         (lambda: vsr.Circular(vsr.Taper(0.01, 0.0)), r"Circular\.radius \(Taper\.tip\)"),
-        (lambda: vsr.Elliptic(0.01, 0.01, torsion="exact"), "torsion: got 'exact', need one of 'saint_venant', 'polar'"),
+        (
+            lambda: vsr.Elliptic(0.01, 0.01, torsion="exact"),
+            "torsion: got 'exact', need one of 'saint_venant', 'polar'",
+        ),
         (lambda: vsr.Circular(0.01, shear_correction=[1, 1, 1]), "shear_correction: got shape"),
-        (lambda: vsr.Material(1e6), "Material: got shear=None and poisson=None, need one of the two"),
+        (
+            lambda: vsr.Material(1e6),
+            "Material: got shear=None and poisson=None, need one of the two",
+        ),
         (lambda: vsr.Material(1e6, shear=1e5, poisson=0.3), "need one of the two"),
-        (lambda: vsr.Circular(), r"Circular: got radius=None and diameter=None, need one of the two"),
-        (lambda: vsr.Circular(0.01, diameter=0.02), r"Circular: got radius=0\.01 and diameter=0\.02, need one of the two"),
-        (lambda: vsr.Circular(diameter=-0.02), r"Circular\.diameter: got -0\.02, need a finite number > 0"),
-        (lambda: vsr.Annular(0.01, 0.02), r"Annular\.inner: got 0\.02 m, need less than the outer radius, 0\.01 m"),
+        (
+            lambda: vsr.Circular(),
+            r"Circular: got radius=None and diameter=None, need one of the two",
+        ),
+        (
+            lambda: vsr.Circular(0.01, diameter=0.02),
+            r"Circular: got radius=0\.01 and diameter=0\.02, need one of the two",
+        ),
+        (
+            lambda: vsr.Circular(diameter=-0.02),
+            r"Circular\.diameter: got -0\.02, need a finite number > 0",
+        ),
+        (
+            lambda: vsr.Annular(0.01, 0.02),
+            r"Annular\.inner: got 0\.02 m, need less than the outer radius, 0\.01 m",
+        ),
         (lambda: vsr.Annular(0.01, 0.01), r"Annular\.inner: got 0\.01 m, need less"),
-        (lambda: vsr.Material(1e6, poisson=0.6), r"Material\.poisson: got 0\.6, need a finite number > -1 and <= 0\.5"),
+        (
+            lambda: vsr.Material(1e6, poisson=0.6),
+            r"Material\.poisson: got 0\.6, need a finite number > -1 and <= 0\.5",
+        ),
         (lambda: vsr.Material(1e6, poisson=-1), r"Material\.poisson: got -1, need"),
-        (lambda: vsr.Material(1e6, poisson=vsr.Piecewise([0.1], [0.3, 0.7])), r"Material\.poisson \(Piecewise\.values\[1\]\): got"),
+        (
+            lambda: vsr.Material(1e6, poisson=vsr.Piecewise([0.1], [0.3, 0.7])),
+            r"Material\.poisson \(Piecewise\.values\[1\]\): got",
+        ),
         (lambda: vsr.Material(-1e6, shear=1e5), r"Material\.young: got -1000000\.0"),
         (lambda: vsr.PolynomialProfile([[0.1]]), "need at least one number in a row"),
         (lambda: vsr.Rod(0.0, vsr.Circular(0.01), STEEL), r"Rod\.length: got 0\.0"),
         (lambda: vsr.Rod(1.0, 0.01, STEEL), r"Rod\.section: got 0\.01, need a section"),
         (lambda: vsr.Rod(1.0, vsr.Circular(0.01), 2e11), r"Rod\.material: got .*, need a Material"),
-        (lambda: vsr.Rod(1.0, vsr.Circular(0.01), STEEL, rest_strain=[0, 0]), r"Rod\.rest_strain: got \[0, 0\], need six profiles"),
-        (lambda: vsr.Rod(1.0, vsr.Circular(0.01), STEEL, base=np.eye(3)), r"Rod\.base: got shape \(3, 3\)"),
-        (lambda: based(np.diag([1.0, 1.0, -1.0, 1.0])), r"Rod\.base: got a reflection \(.* determinant -1\), need a rigid transform"),
-        (lambda: based(np.diag([2.0, 2.0, 2.0, 1.0])), r"Rod\.base: got columns of a rotation that are not orthonormal \(.* by 3\)"),
+        (
+            lambda: vsr.Rod(1.0, vsr.Circular(0.01), STEEL, rest_strain=[0, 0]),
+            r"Rod\.rest_strain: got \[0, 0\], need six profiles",
+        ),
+        (
+            lambda: vsr.Rod(1.0, vsr.Circular(0.01), STEEL, base=np.eye(3)),
+            r"Rod\.base: got shape \(3, 3\)",
+        ),
+        (
+            lambda: based(np.diag([1.0, 1.0, -1.0, 1.0])),
+            r"Rod\.base: got a reflection \(.* determinant -1\), need a rigid transform",
+        ),
+        (
+            lambda: based(np.diag([2.0, 2.0, 2.0, 1.0])),
+            r"Rod\.base: got columns of a rotation that are not orthonormal \(.* by 3\)",
+        ),
         (lambda: based(np.diag([0.0, 0.0, 0.0, 1.0])), r"Rod\.base: got a rotation of zeros"),
         (lambda: based(np.eye(4) + np.eye(4, k=-3)), r"Rod\.base: got a last row of 1 0 0 1"),
-        (lambda: vsr.objective.TipError([np.eye(4), np.diag([1.0, 1.0, -1.0, 1.0])]), r"TipError\.targets\[1\]: got a reflection"),
+        (
+            lambda: vsr.objective.TipError([np.eye(4), np.diag([1.0, 1.0, -1.0, 1.0])]),
+            r"TipError\.targets\[1\]: got a reflection",
+        ),
     ],
 )
 @pytest.mark.usefixtures("unchecked")
@@ -158,7 +234,9 @@ def test_a_base_needs_six_digits_in_double_precision_and_three_in_single():
     pose = np.asarray(vsr.se3.exp(jnp.array([0.3, -0.7, 2.0, 0.1, 0.2, 0.3])))
     based(pose.round(6))
     based(pose.round(4).astype(np.float32))
-    with pytest.raises(ValueError, match=r"Rod\.base: got columns of a rotation that are not orthonormal"):
+    with pytest.raises(
+        ValueError, match=r"Rod\.base: got columns of a rotation that are not orthonormal"
+    ):
         based(pose.round(4))
 
 

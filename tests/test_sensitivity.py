@@ -1,4 +1,5 @@
-"""How a tip moves with numbers, inputs and wrenches: against differences of other solves, and beams that are known."""
+"""How a tip moves with numbers, inputs and wrenches: against differences of other solves, and beams
+that are known."""
 
 import equinox as eqx
 import jax
@@ -7,8 +8,8 @@ import numpy as np
 import pytest
 
 import vsr_jax as vsr
-from vsr_jax.model import SteppedModel
-from vsr_jax.parameters import replaced
+from vsr_jax.arm.scene_numbers import replaced
+from vsr_jax.models.base import SteppedModel
 
 MODEL, FINER = vsr.StrainDependent(8), vsr.StrainDependent(12)
 LENGTH = 0.3
@@ -17,7 +18,11 @@ LENGTH = 0.3
 @pytest.fixture(scope="module")
 def eq():
     arm = vsr.Rod(LENGTH, vsr.Circular(vsr.Taper(0.012, 0.010)), vsr.Material(8e5, poisson=0.45))
-    threads = [vsr.Tendon(vsr.Helix(0.006, 1.5)), vsr.Tendon(vsr.Parallel(0.0, -0.006)), vsr.Tendon(vsr.Polynomial([0.001, 0.01], [0.005]))]
+    threads = [
+        vsr.Tendon(vsr.Helix(0.006, 1.5)),
+        vsr.Tendon(vsr.Parallel(0.0, -0.006)),
+        vsr.Tendon(vsr.Polynomial([0.001, 0.01], [0.005])),
+    ]
     return vsr.solve(vsr.Scene(arm, threads), jnp.array([4.0, 2.0, 1.0]), model=MODEL)
 
 
@@ -33,16 +38,31 @@ def tip_of():
 
 def motion(ahead, behind, step):
     """Turn and displacement by a number, from poses a step to both sides of it."""
-    turn = (ahead[:3, :3] - behind[:3, :3]) / (2 * step) @ (0.5 * (ahead[:3, :3] + behind[:3, :3])).T
-    turn = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    turn = (
+        (ahead[:3, :3] - behind[:3, :3]) / (2 * step) @ (0.5 * (ahead[:3, :3] + behind[:3, :3])).T
+    )
+    turn = 0.5 * np.array(
+        [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
+    )
     return turn, (ahead[:3, 3] - behind[:3, 3]) / (2 * step)
 
 
-@pytest.mark.parametrize("name", ["rod.material.young", "rod.section.radius.tip", "actuators[0].routing.angle", "actuators[1].routing.z"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "rod.material.young",
+        "rod.section.radius.tip",
+        "actuators[0].routing.angle",
+        "actuators[1].routing.z",
+    ],
+)
 def test_rows_are_differences_of_finer_solves(eq, table, tip_of, name):
     value = float(vsr.parameters(eq.scene)[name].value)
     step = 1e-5 * abs(value)
-    ahead, behind = (np.asarray(tip_of(replaced(eq.scene, {name: jnp.array(value + d)}), eq.inputs)) for d in (step, -step))
+    ahead, behind = (
+        np.asarray(tip_of(replaced(eq.scene, {name: jnp.array(value + d)}), eq.inputs))
+        for d in (step, -step)
+    )
     turn, place = motion(ahead, behind, step)
     row = table[name]
     np.testing.assert_allclose(row.place, place, atol=2e-6 * np.linalg.norm(place))
@@ -54,7 +74,9 @@ def test_inputs_are_rows_too_and_the_jacobian_has_them(eq, table, tip_of):
     for i in range(3):
         step = np.eye(3)[i] * 1e-4
         ahead, behind = (np.asarray(tip_of(eq.scene, eq.inputs + sign * step)) for sign in (1, -1))
-        np.testing.assert_allclose(J[:, i], np.concatenate(motion(ahead, behind, 1e-4)), atol=1e-6 * np.abs(J).max())
+        np.testing.assert_allclose(
+            J[:, i], np.concatenate(motion(ahead, behind, 1e-4)), atol=1e-6 * np.abs(J).max()
+        )
         np.testing.assert_allclose(table[f"inputs[{i}]"].place, J[3:, i], atol=1e-12)
     assert table["inputs[0]"].unit == "N"
 
@@ -68,7 +90,8 @@ def test_the_table_reads_well(table):
 
 
 def test_compliance_of_a_straight_beam_is_the_textbooks():
-    """Timoshenko's cantilever: L^3 / 3EI + L / kGA across, L / EA along, L / GJ in torsion, L^2 / 2EI between."""
+    """Timoshenko's cantilever: L^3 / 3EI + L / kGA across, L / EA along, L / GJ in torsion, L^2 /
+    2EI between."""
     arm = vsr.Rod(LENGTH, vsr.Circular(0.01), vsr.Material(8e5, shear=3e5))
     scene = vsr.Scene(arm, [vsr.Thread(vsr.Parallel(0.0, 0.0))])
     C = np.asarray(vsr.compliance(vsr.solve(scene, jnp.zeros(1), model=MODEL)))
@@ -84,26 +107,40 @@ def test_compliance_of_a_straight_beam_is_the_textbooks():
 
 
 def test_compliance_is_what_a_small_wrench_does(eq):
-    """The quadrature along a bent arm against solves under a wrench, which take another way altogether."""
+    """The quadrature along a bent arm against solves under a wrench, which take another way
+    altogether."""
     C = vsr.compliance(eq)
     pushed = jax.jit(
-        lambda w: vsr.solve(vsr.Scene(eq.scene.rod, eq.scene.actuators, [vsr.TipWrench(w[3:], w[:3])]), eq.inputs, model=FINER).tip
+        lambda w: (
+            vsr.solve(
+                vsr.Scene(eq.scene.rod, eq.scene.actuators, [vsr.TipWrench(w[3:], w[:3])]),
+                eq.inputs,
+                model=FINER,
+            ).tip
+        )
     )
     for i, step in ((1, 1e-5), (4, 1e-4)):
-        ahead, behind = (np.asarray(pushed(jnp.asarray(sign * step * np.eye(6)[i]))) for sign in (1, -1))
-        np.testing.assert_allclose(C[:, i], np.concatenate(motion(ahead, behind, step)), atol=1e-4 * np.abs(C[:, i]).max())
+        ahead, behind = (
+            np.asarray(pushed(jnp.asarray(sign * step * np.eye(6)[i]))) for sign in (1, -1)
+        )
+        np.testing.assert_allclose(
+            C[:, i], np.concatenate(motion(ahead, behind, step)), atol=1e-4 * np.abs(C[:, i]).max()
+        )
     np.testing.assert_allclose(C, C.T, atol=1e-9 * np.abs(C).max())
 
 
 class Approximate(SteppedModel):
-    """A model of somebody else's, of which nothing is known but what models have to have: strains in one wave each."""
+    """A model of somebody else's, of which nothing is known but what models have to have: strains
+    in one wave each."""
 
     steps: int = eqx.field(static=True, default=8)
     order: int = eqx.field(static=True, default=4)
 
     @property
     def inner(self):
-        return vsr.Prescribed(vsr.Basis.uniform(vsr.Legendre(0)), points=8, steps=self.steps, order=self.order)
+        return vsr.Prescribed(
+            vsr.Basis.uniform(vsr.Legendre(0)), points=8, steps=self.steps, order=self.order
+        )
 
     def solve(self, scene, inputs):
         return self.inner.solve(scene, inputs)
@@ -119,15 +156,26 @@ class Approximate(SteppedModel):
 
 
 def test_compliance_of_a_model_that_says_nothing_is_the_derivative_of_its_solve(eq):
-    """The balance of its sections does not hold, so the integral of their compliances is another matrix."""
+    """The balance of its sections does not hold, so the integral of their compliances is another
+    matrix."""
     found = vsr.solve(eq.scene, eq.inputs, model=Approximate())
     C, balanced = vsr.compliance(found), vsr.compliance(eq)
     pushed = jax.jit(
-        lambda w: vsr.solve(vsr.Scene(eq.scene.rod, eq.scene.actuators, [vsr.TipWrench(w[3:], w[:3])]), eq.inputs, model=Approximate()).tip
+        lambda w: (
+            vsr.solve(
+                vsr.Scene(eq.scene.rod, eq.scene.actuators, [vsr.TipWrench(w[3:], w[:3])]),
+                eq.inputs,
+                model=Approximate(),
+            ).tip
+        )
     )
     step = 1e-4
-    ahead, behind = (np.asarray(pushed(jnp.asarray(sign * step * np.eye(6)[4]))) for sign in (1, -1))
-    np.testing.assert_allclose(C[:, 4], np.concatenate(motion(ahead, behind, step)), atol=1e-5 * np.abs(C[:, 4]).max())
+    ahead, behind = (
+        np.asarray(pushed(jnp.asarray(sign * step * np.eye(6)[4]))) for sign in (1, -1)
+    )
+    np.testing.assert_allclose(
+        C[:, 4], np.concatenate(motion(ahead, behind, step)), atol=1e-5 * np.abs(C[:, 4]).max()
+    )
     assert np.abs(C - balanced)[:, 4].max() > 0.05 * np.abs(C[:, 4]).max()
 
 
@@ -135,7 +183,9 @@ def test_compliance_of_a_model_that_says_nothing_is_the_derivative_of_its_solve(
 def test_compliance_under_loads_and_of_a_basis(eq):
     scene = vsr.Scene(eq.scene.rod, eq.scene.actuators, [vsr.TipWrench(force=(0.0, 0.0, -0.01))])
     models = (MODEL, vsr.Prescribed(vsr.Basis.uniform(vsr.Legendre(4))))
-    loaded, other = (np.asarray(vsr.compliance(vsr.solve(scene, eq.inputs, model=model))) for model in models)
+    loaded, other = (
+        np.asarray(vsr.compliance(vsr.solve(scene, eq.inputs, model=model))) for model in models
+    )
     np.testing.assert_allclose(loaded, other, atol=1e-3 * np.abs(loaded).max())
     np.testing.assert_allclose(loaded, loaded.T, atol=0.02 * np.abs(loaded).max())
 
@@ -147,7 +197,9 @@ def test_ellipsoids(eq):
     np.testing.assert_allclose(found.axes @ found.axes.T, 4 * J @ J.T, atol=1e-12)
     np.testing.assert_allclose(found.centre, eq.tip[:3, 3])
     softest = vsr.compliance_ellipsoid(eq)
-    np.testing.assert_allclose(np.linalg.norm(softest.axes[:, 0]), np.linalg.norm(vsr.compliance(eq)[3:, 3:], 2), rtol=1e-9)
+    np.testing.assert_allclose(
+        np.linalg.norm(softest.axes[:, 0]), np.linalg.norm(vsr.compliance(eq)[3:, 3:], 2), rtol=1e-9
+    )
 
 
 def test_under_vmap_jit_and_grad_and_in_single_precision(eq):

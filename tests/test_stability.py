@@ -1,4 +1,5 @@
-"""The stability margin: the tangent of all nodes against the derivative of the residual, and Lanczos' method against dense eigenvalues."""
+"""The stability margin: the tangent of all nodes against the derivative of the residual, and
+Lanczos' method against dense eigenvalues."""
 
 import equinox as eqx
 import jax
@@ -8,12 +9,19 @@ import pytest
 from conftest import epsilon
 
 import vsr_jax as vsr
-from vsr_jax import lanczos
-from vsr_jax.balance import chosen, residual, spread, thread_direction, thread_wrench, with_locked
-from vsr_jax.lanczos import Operator, extreme_pairs
-from vsr_jax.model import Nodes
-from vsr_jax.reaction import loading, react
-from vsr_jax.stability import arm_of, extreme
+from vsr_jax.mechanics.balance import (
+    chosen,
+    residual,
+    spread,
+    thread_direction,
+    thread_wrench,
+    with_locked,
+)
+from vsr_jax.mechanics.reaction import loading, react
+from vsr_jax.models.base import Nodes
+from vsr_jax.numerics import lanczos
+from vsr_jax.numerics.lanczos import Operator, extreme_pairs
+from vsr_jax.solution.stability import arm_of, extreme
 
 MODEL = vsr.StrainDependent(8)
 LENGTH = 0.4
@@ -26,8 +34,13 @@ FOLLOWERS = [
 
 
 def arm(loads, *, end=None, control="tension", count=2, **options):
-    rod = vsr.Rod(LENGTH, vsr.Circular(vsr.Taper(0.008, 0.006)), vsr.Material(6e5, shear=2e5, density=1080.0))
-    threads = [vsr.Tendon(vsr.Helix(0.004, 1.5, phase=2.0 * i), end=end, control=control) for i in range(count)]
+    rod = vsr.Rod(
+        LENGTH, vsr.Circular(vsr.Taper(0.008, 0.006)), vsr.Material(6e5, shear=2e5, density=1080.0)
+    )
+    threads = [
+        vsr.Tendon(vsr.Helix(0.004, 1.5, phase=2.0 * i), end=end, control=control)
+        for i in range(count)
+    ]
     return vsr.Scene(rod, threads, loads, **options)
 
 
@@ -35,33 +48,55 @@ def bent(scene, size=1.0, model=MODEL):
     """Nodes of a bent arm, not in balance: the tangent is defined there too."""
     grid = model.grid(scene)
     sections, X = scene.sections(grid.X), grid.X / scene.rod.length
-    waves = [2 * jnp.sin(3 * X), 3 * jnp.cos(2 * X), 4 * X, 0.05 * X, 0.03 * jnp.sin(X), 0.02 * jnp.cos(X)]
+    waves = [
+        2 * jnp.sin(3 * X),
+        3 * jnp.cos(2 * X),
+        4 * X,
+        0.05 * X,
+        0.03 * jnp.sin(X),
+        0.02 * jnp.cos(X),
+    ]
     moving = spread(chosen(tuple(waves), scene.free), scene.free)
-    xi = tuple(jnp.broadcast_to(rest, X.shape) + size * wave for rest, wave in zip(sections.rest, moving, strict=True))
+    xi = tuple(
+        jnp.broadcast_to(rest, X.shape) + size * wave
+        for rest, wave in zip(sections.rest, moving, strict=True)
+    )
     return Nodes(grid, xi, sections, sections.reach)
 
 
 def dense(scene, forces, nodes):
-    """The whole scaled tangent by forward differentiation of the residual, symmetric part, where changes of strain are allowed."""
+    """The whole scaled tangent by forward differentiation of the residual, symmetric part, where
+    changes of strain are allowed."""
     grid, free = nodes.grid, scene.free
     loads, tau = loading(scene, grid), nodes.tau(forces)
     still = jnp.stack(chosen(nodes.xi, free))
 
     def imbalance(values):
         xi = with_locked(spread(tuple(values), free), nodes.xi, free)
-        return jnp.stack(chosen(residual(xi, nodes.sections, tau, react(xi, grid, loads).wrench), free))
+        return jnp.stack(
+            chosen(residual(xi, nodes.sections, tau, react(xi, grid, loads).wrench), free)
+        )
 
     jacobian = np.asarray(jax.jit(jax.jacfwd(imbalance))(still)).reshape(still.size, still.size)
     weight = np.broadcast_to(grid.weight, still.shape).reshape(-1)
-    root = np.sqrt(weight * np.stack([np.broadcast_to(s, grid.X.shape) for s in chosen(nodes.sections.stiffness, free)]).reshape(-1))
+    root = np.sqrt(
+        weight
+        * np.stack(
+            [np.broadcast_to(s, grid.X.shape) for s in chosen(nodes.sections.stiffness, free)]
+        ).reshape(-1)
+    )
     there = weight > 0
     scaled = (weight[:, None] * jacobian)[there][:, there] / np.outer(root[there], root[there])
     forbidden = [np.zeros((there.sum(), 0))]
     for place in scene.length_driven:
         path, reach = nodes.sections.paths[place], nodes.sections.reach[place]
-        unit = np.stack(chosen(thread_wrench(thread_direction(nodes.xi, path)[0], path), free)) * (1.0 if reach is None else reach)
+        unit = np.stack(chosen(thread_wrench(thread_direction(nodes.xi, path)[0], path), free)) * (
+            1.0 if reach is None else reach
+        )
         if forces[place] < 0:
-            forbidden.append(((np.asarray(grid.weight) * unit).reshape(-1)[there] / root[there])[:, None])
+            forbidden.append(
+                ((np.asarray(grid.weight) * unit).reshape(-1)[there] / root[there])[:, None]
+            )
     forbidden = np.concatenate(forbidden, axis=1)
     allowed = np.linalg.svd(forbidden)[0][:, forbidden.shape[1] :]
     return allowed.T @ (0.5 * (scaled + scaled.T)) @ allowed
@@ -71,11 +106,17 @@ CASES = {
     "dead loads": (arm(DEAD), (-1.0, -2.0)),
     "followers": (arm(FOLLOWERS), (-1.0, -2.0)),
     "dead moment, locked strains": (
-        arm([vsr.TipWrench(moment=(0.02, 0.01, 0.03))], free_strains=["torsion", "bending_y", "bending_z"]),
+        arm(
+            [vsr.TipWrench(moment=(0.02, 0.01, 0.03))],
+            free_strains=["torsion", "bending_y", "bending_z"],
+        ),
         (-1.0, -2.0),
     ),
     # two of the pieces between their ends are empty: the scaled tangent was 0 / 0 there
-    "threads that end at one place": (arm([vsr.Gravity()], end=LENGTH / 2, count=3), (-1.0, -2.0, -1.0)),
+    "threads that end at one place": (
+        arm([vsr.Gravity()], end=LENGTH / 2, count=3),
+        (-1.0, -2.0, -1.0),
+    ),
     "cables, one of them slack": (arm(DEAD, control="length", count=3), (-1.0, 0.0, -2.0)),
     "hanging from its end": (arm([vsr.TipWrench(force=(20.0, 0.0, 0.0))]), (0.0, 0.0)),
 }
@@ -99,13 +140,17 @@ def test_the_ends_of_the_spectrum_are_those_of_the_dense_tangent(name):
     np.testing.assert_allclose(pairs.values[1], expected[-1], rtol=1e-9)
     np.testing.assert_allclose(np.sum(pairs.vectors**2, axis=(1, 2, 3)), 1, rtol=1e-12)
     np.testing.assert_allclose(allowed, pairs.vectors, atol=1e-12)
-    np.testing.assert_allclose(products[0], pairs.values[0] * pairs.vectors[0], atol=1e-9 * max(1, expected[-1]))
+    np.testing.assert_allclose(
+        products[0], pairs.values[0] * pairs.vectors[0], atol=1e-9 * max(1, expected[-1])
+    )
 
 
 def margin(p):
     """Least eigenvalue as a function of the size of bend, load and tension."""
     scene, forces = CASES["cables, one of them slack"]
-    scene = eqx.tree_at(lambda scene: scene.loads[1].force, scene, scene.loads[1].force * p[1]).astype(p.dtype)
+    scene = eqx.tree_at(
+        lambda scene: scene.loads[1].force, scene, scene.loads[1].force * p[1]
+    ).astype(p.dtype)
     nodes = bent(scene, p[0], vsr.StrainDependent(12, 2))
     return extreme(scene, tuple(jnp.asarray(f, p.dtype) * p[2] for f in forces), nodes)
 
@@ -122,12 +167,18 @@ def test_derivatives_are_those_of_differences(slopes):
     steps = np.concatenate([np.zeros((1, 3)), *(h * np.eye(3) for h in (1e-3, -1e-3, 2e-3, -2e-3))])
     value, slope = (np.asarray(x) for x in slopes(jnp.asarray(POINT + steps)))
     ahead, behind, further, back = (value[1 + 3 * i : 4 + 3 * i] for i in range(4))
-    np.testing.assert_allclose(slope[0], (8 * (ahead - behind) - (further - back)) / 12e-3, atol=1e-8 * np.abs(slope[0]).max())
+    np.testing.assert_allclose(
+        slope[0],
+        (8 * (ahead - behind) - (further - back)) / 12e-3,
+        atol=1e-8 * np.abs(slope[0]).max(),
+    )
 
 
 def test_second_derivatives_are_those_of_differences(slopes):
     direction = np.array([0.3, -0.5, 0.7])
-    slope = np.asarray(slopes(jnp.asarray(POINT + 1e-3 * np.outer([1, -1, 2, -2] + [0] * 9, direction)))[1])
+    slope = np.asarray(
+        slopes(jnp.asarray(POINT + 1e-3 * np.outer([1, -1, 2, -2] + [0] * 9, direction)))[1]
+    )
     expected = (8 * (slope[0] - slope[1]) - (slope[2] - slope[3])) @ direction / 12e-3
 
     def rate(p):
@@ -203,7 +254,11 @@ SPECTRA = {
 def test_spectra_that_are_hard(name, dtype):
     spectrum = SPECTRA[name]
     found = jax.jit(extreme_pairs)(Diagonal(jnp.asarray(spectrum, dtype))).values
-    near = max(1e-10, 50 * epsilon(dtype) * np.abs(spectrum).max()) if dtype == "float64" else 1e-4 * np.abs(spectrum).max()
+    near = (
+        max(1e-10, 50 * epsilon(dtype) * np.abs(spectrum).max())
+        if dtype == "float64"
+        else 1e-4 * np.abs(spectrum).max()
+    )
     np.testing.assert_allclose(found, [spectrum.min(), spectrum.max()], atol=near)
 
 
@@ -226,13 +281,15 @@ def test_derivatives_of_both_ends_of_any_order():
     p = jnp.array([0.3, -0.2])
     for derivative in (jax.jacfwd, jax.jacrev, jax.hessian, lambda f: jax.jacfwd(jax.hessian(f))):
         found, expected = (
-            jax.jit(derivative(lambda p, f=f: ends(p, f)))(p) for f in (lambda S: extreme_pairs(Matrix(S)).values, dense_ends)
+            jax.jit(derivative(lambda p, f=f: ends(p, f)))(p)
+            for f in (lambda S: extreme_pairs(Matrix(S)).values, dense_ends)
         )
         np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
 
 
 def test_an_arm_without_loads_is_judged_section_by_section():
-    """Whether threads are driven by their tension or hold their length: no finite number of cables steadies every section."""
+    """Whether threads are driven by their tension or hold their length: no finite number of cables
+    steadies every section."""
     given, held = (arm([], control=control) for control in ("tension", "length"))
     forces = tuple(jnp.asarray(f) for f in (-1.0, -2.0))
     values = [eqx.filter_jit(extreme)(scene, forces, bent(scene)) for scene in (given, held)]

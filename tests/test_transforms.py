@@ -1,4 +1,5 @@
-"""jit, vmap and grad through every result of every model: forward = reverse = finite differences."""
+"""jit, vmap and grad through every result of every model: forward = reverse = finite
+differences."""
 
 import equinox as eqx
 import jax
@@ -8,7 +9,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import vsr_jax as vsr
-from vsr_jax import paper
+from vsr_jax.studies import paper
 
 MODELS = {
     "strain-dependent": vsr.StrainDependent(24),
@@ -19,7 +20,8 @@ MODELS = {
 
 @pytest.fixture(scope="module")
 def scene():
-    """A hollow cone, bent at rest, on a turned base, with a helical chamber: each number of it is differentiated."""
+    """A hollow cone, bent at rest, on a turned base, with a helical chamber: each number of it is
+    differentiated."""
     arm = vsr.Rod(
         0.6,
         vsr.Annular(vsr.Taper(0.012, 0.010), 0.003),
@@ -41,7 +43,13 @@ def results(scene, inputs, model):
     return jnp.concatenate([eq.tip[:3].ravel(), eq.pose(0.31)[:3].ravel(), eq.lengths, eq.q])
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[] if name == "strain-dependent" else pytest.mark.slow) for name in MODELS])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[] if name == "strain-dependent" else pytest.mark.slow)
+        for name in MODELS
+    ],
+)
 def test_derivatives_by_every_number_agree(name, scene):
     model = MODELS[name]
     numbers, rebuild = ravel_pytree((scene, INPUTS))
@@ -60,10 +68,19 @@ def test_derivatives_by_every_number_agree(name, scene):
         forward, h = push(numbers, unit), 1e-4 * abs(x) or 1e-6
         scale = np.abs(forward).max() + 1e-9
         difference = (
-            8 * (value(numbers + h * unit) - value(numbers - h * unit)) - value(numbers + 2 * h * unit) + value(numbers - 2 * h * unit)
+            8 * (value(numbers + h * unit) - value(numbers - h * unit))
+            - value(numbers + 2 * h * unit)
+            + value(numbers - 2 * h * unit)
         ) / (12 * h)
-        np.testing.assert_allclose(forward / scale, difference / scale, atol=accuracy, err_msg=f"number {i}, value {x}")
-        np.testing.assert_allclose(reverse[i] / scale, jnp.dot(cotangent, forward) / scale, atol=1e-9, err_msg=f"number {i}, value {x}")
+        np.testing.assert_allclose(
+            forward / scale, difference / scale, atol=accuracy, err_msg=f"number {i}, value {x}"
+        )
+        np.testing.assert_allclose(
+            reverse[i] / scale,
+            jnp.dot(cotangent, forward) / scale,
+            atol=1e-9,
+            err_msg=f"number {i}, value {x}",
+        )
 
 
 @pytest.mark.slow
@@ -75,7 +92,9 @@ def test_second_derivatives(helix):
 
     at, h = jnp.asarray(-9.0), 1e-2
     values = [float(height(at + i * h)) for i in (-2, -1, 0, 1, 2)]
-    second = (-values[0] + 16 * values[1] - 30 * values[2] + 16 * values[3] - values[4]) / (12 * h**2)
+    second = (-values[0] + 16 * values[1] - 30 * values[2] + 16 * values[3] - values[4]) / (
+        12 * h**2
+    )
     np.testing.assert_allclose(jax.jit(jax.grad(jax.grad(height)))(at), second, rtol=1e-6)
 
 
@@ -86,7 +105,9 @@ def test_vmap_is_the_loop(name, helix):
     def tip(tau):
         return vsr.solve(helix, tau, model=MODELS[name]).tip
 
-    np.testing.assert_allclose(jax.jit(jax.vmap(tip))(taus), jnp.stack([tip(t) for t in taus]), atol=1e-12)
+    np.testing.assert_allclose(
+        jax.jit(jax.vmap(tip))(taus), jnp.stack([tip(t) for t in taus]), atol=1e-12
+    )
 
 
 def test_vmap_over_designs(helix):
@@ -96,7 +117,9 @@ def test_vmap_over_designs(helix):
         scene = eqx.tree_at(lambda s: s.actuators[0].routing.radius, helix, radius)
         return vsr.solve(scene, jnp.array([-5.0])).tip[:3, 3]
 
-    np.testing.assert_allclose(jax.jit(jax.vmap(tip))(radii), jnp.stack([tip(r) for r in radii]), atol=1e-13)
+    np.testing.assert_allclose(
+        jax.jit(jax.vmap(tip))(radii), jnp.stack([tip(r) for r in radii]), atol=1e-13
+    )
 
 
 def test_a_batch_of_equilibria_gives_its_results_under_vmap(helix):
@@ -112,17 +135,32 @@ def test_a_scene_may_be_built_under_jit():
     @jax.jit
     def tip(radius):
         arm = vsr.Rod(0.75, vsr.Circular(0.01), vsr.Material(5.93e5, shear=2e5))
-        return vsr.solve(vsr.Scene(arm, [vsr.Thread(vsr.Helix(radius, 1.529))]), jnp.array([-15.0])).tip[:3, 3]
+        return vsr.solve(
+            vsr.Scene(arm, [vsr.Thread(vsr.Helix(radius, 1.529))]), jnp.array([-15.0])
+        ).tip[:3, 3]
 
-    np.testing.assert_allclose(tip(0.005), vsr.solve(paper.scene("B1"), [-15.0]).tip[:3, 3], atol=1e-13)
+    np.testing.assert_allclose(
+        tip(0.005), vsr.solve(paper.scene("B1"), [-15.0]).tip[:3, 3], atol=1e-13
+    )
 
 
 @pytest.mark.parametrize(
-    "quantity", [*(pytest.param(name, marks=pytest.mark.slow) for name in ("position", "reaction")), "strain", "thread"]
+    "quantity",
+    [
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("position", "reaction")),
+        "strain",
+        "thread",
+    ],
 )
 def test_traced_places_beyond_the_arm_are_nan_and_harm_no_others(quantity):
-    arm = vsr.Rod(0.5, vsr.Circular(lambda x: 0.01 + 0.002 * jnp.sqrt(0.5 - x)), vsr.Material(1e6, poisson=0.5))  # NaN beyond the arm
-    scene = vsr.Scene(arm, [vsr.Tendon(vsr.Parallel(0.005, 0.0), end=0.3)], [vsr.TipWrench(force=(0.0, 0.1, 0.0))])
+    arm = vsr.Rod(
+        0.5,
+        vsr.Circular(lambda x: 0.01 + 0.002 * jnp.sqrt(0.5 - x)),
+        vsr.Material(1e6, poisson=0.5),
+    )  # NaN beyond the arm
+    scene = vsr.Scene(
+        arm, [vsr.Tendon(vsr.Parallel(0.005, 0.0), end=0.3)], [vsr.TipWrench(force=(0.0, 0.1, 0.0))]
+    )
     eq = vsr.solve(scene, jnp.array([1.0]), model=vsr.StrainDependent(8))
 
     def at(X):
@@ -150,26 +188,36 @@ def test_gradients_in_single_precision(helix):
         return vsr.solve(scene, tau, model=MODELS["strain-dependent"]).tip[2, 3]
 
     double = jax.jit(jax.grad(height))(helix, jnp.array([-9.0])).actuators[0].routing
-    single = jax.jit(jax.grad(height))(helix.astype(jnp.float32), jnp.array([-9.0], jnp.float32)).actuators[0].routing
+    single = (
+        jax.jit(jax.grad(height))(helix.astype(jnp.float32), jnp.array([-9.0], jnp.float32))
+        .actuators[0]
+        .routing
+    )
     assert single.radius.dtype == jnp.float32
     np.testing.assert_allclose(single.radius, double.radius, rtol=2e-4)
     np.testing.assert_allclose(single.angle, double.angle, rtol=2e-4)
 
 
 LOADED = vsr.Scene(
-    vsr.Rod(0.3, vsr.Circular(vsr.Taper(0.011, 0.009)), vsr.Material(1e6, poisson=0.45, density=1000.0)),
+    vsr.Rod(
+        0.3, vsr.Circular(vsr.Taper(0.011, 0.009)), vsr.Material(1e6, poisson=0.45, density=1000.0)
+    ),
     [
         vsr.Tendon(vsr.Parallel(0.007, 0.0), control="length", stiffness=2e3, friction=0.1),
         vsr.Tendon(vsr.Helix(0.007, pitch=0.4), end=0.2),
     ],
     [vsr.Gravity(), vsr.PointWrench(0.15, force=(0.0, 0.03, 0.0), frame="body")],
 )
-STEPS = {"strain-dependent": vsr.StrainDependent(8), "prescribed": vsr.Prescribed(vsr.Basis.uniform(vsr.Legendre(2)), steps=8)}
+STEPS = {
+    "strain-dependent": vsr.StrainDependent(8),
+    "prescribed": vsr.Prescribed(vsr.Basis.uniform(vsr.Legendre(2)), steps=8),
+}
 
 
 @pytest.mark.parametrize("name", STEPS)
 def test_loaded_solves_mix_no_precisions(name, dtype):
-    """Tracing is enough: under strict promotion JAX refuses a single operation between two precisions."""
+    """Tracing is enough: under strict promotion JAX refuses a single operation between two
+    precisions."""
 
     def height(inputs):
         eq = vsr.solve(LOADED, inputs, model=STEPS[name])

@@ -1,91 +1,185 @@
-"""Differentiable statics of soft manipulators: Cosserat rods bent by tendons and fluidic chambers."""
+"""Differentiable statics of soft manipulators: Cosserat rods bent by tendons and fluidic
+chambers."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from . import constraint as constraint, objective as objective, se3 as se3
-from .actuator import Chamber as Chamber, Tendon as Tendon, Thread as Thread
-from .basis import (
-    Basis as Basis,
-    FunctionBasis as FunctionBasis,
-    Functions as Functions,
-    Legendre as Legendre,
-    Monomial as Monomial,
-    PiecewiseConstant as PiecewiseConstant,
-    Trigonometric as Trigonometric,
+from .analysis import (
+    Branch,
+    Ellipsoid,
+    Health,
+    Reach,
+    Sensitivity,
+    Sweep,
+    check,
+    compliance,
+    compliance_ellipsoid,
+    follow_branch,
+    manipulability,
+    reach,
+    sensitivity,
+    sweep,
+    tip_jacobian,
 )
-from .continuation import Branch as Branch, trace as trace
-from .discrete import (
-    Prescribed as Prescribed,
-    actuation_matrix as actuation_matrix,
-    jacobian as jacobian,
-    stiffness_matrix as stiffness_matrix,
+from .arm import (
+    Annular,
+    Chamber,
+    Circular,
+    Constant,
+    DistributedWrench,
+    Elliptic,
+    Function,
+    FunctionProfile,
+    Gravity,
+    Helix,
+    Joined,
+    Linear,
+    Material,
+    Parallel,
+    Parameter,
+    Piecewise,
+    PointWrench,
+    Polynomial,
+    PolynomialProfile,
+    Rectangular,
+    Rod,
+    Scene,
+    Spline,
+    SplineProfile,
+    Taper,
+    Tendon,
+    Thread,
+    TipWrench,
+    parameters,
 )
-from .equilibrium import Equilibrium as Equilibrium
-from .estimate import Error as Error
-from .health import Health as Health, check as check
-from .inverse import Reach as Reach, reach as reach
-from .kinematics import step_twist as step_twist, zanna_step as zanna_step
-from .load import (
-    DistributedWrench as DistributedWrench,
-    Gravity as Gravity,
-    PointWrench as PointWrench,
-    TipWrench as TipWrench,
+from .files import SceneFile, load, save
+from .models import (
+    Basis,
+    FunctionBasis,
+    Functions,
+    Legendre,
+    Monomial,
+    PiecewiseConstant,
+    Prescribed,
+    Status,
+    StrainDependent,
+    Trigonometric,
+    actuation_matrix,
+    jacobian,
+    stiffness_matrix,
 )
-from .material import Material as Material
-from .model import Status as Status
-from .parameters import Parameter as Parameter, parameters as parameters
-from .plan import Plan as Plan, plan as plan
-from .profile import (
-    Constant as Constant,
-    FunctionProfile as FunctionProfile,
-    Piecewise as Piecewise,
-    PolynomialProfile as PolynomialProfile,
-    SplineProfile as SplineProfile,
-    Taper as Taper,
-)
-from .rod import Rod as Rod
-from .routing import (
-    Function as Function,
-    Helix as Helix,
-    Linear as Linear,
-    Parallel as Parallel,
-    Polynomial as Polynomial,
-    Spline as Spline,
-)
-from .scene import Scene as Scene
-from .section import (
-    Annular as Annular,
-    Circular as Circular,
-    Elliptic as Elliptic,
-    Joined as Joined,
-    Rectangular as Rectangular,
-)
-from .sensitivity import (
-    Ellipsoid as Ellipsoid,
-    Sensitivity as Sensitivity,
-    compliance as compliance,
-    compliance_ellipsoid as compliance_ellipsoid,
-    manipulability as manipulability,
-    sensitivity as sensitivity,
-    tip_jacobian as tip_jacobian,
-)
-from .solve import SolveError as SolveError, solve as solve
-from .strain_dependent import StrainDependent as StrainDependent
-from .sweep import Sweep as Sweep, sweep as sweep
+from .numerics import se3, step_twist, zanna_step
+from .optimization import constraint, objective
+from .solution import Equilibrium, Error, Plan, SolveError, plan, solve
 
 if TYPE_CHECKING:
-    from .continuum import Continuum as Continuum
-    from .optimize import Design as Design, design as design
+    from .models.continuum import Continuum
+    from .optimization.design_search import Design, design
+    from .viz import annotate, plot, plot_design
+    from .viz.animation import film
 
 __version__ = "0.1.0"
 
+__all__ = [
+    "Annular",
+    "Basis",
+    "Branch",
+    "Chamber",
+    "Circular",
+    "Constant",
+    "Continuum",
+    "Design",
+    "DistributedWrench",
+    "Ellipsoid",
+    "Elliptic",
+    "Equilibrium",
+    "Error",
+    "Function",
+    "FunctionBasis",
+    "FunctionProfile",
+    "Functions",
+    "Gravity",
+    "Health",
+    "Helix",
+    "Joined",
+    "Legendre",
+    "Linear",
+    "Material",
+    "Monomial",
+    "Parallel",
+    "Parameter",
+    "Piecewise",
+    "PiecewiseConstant",
+    "Plan",
+    "PointWrench",
+    "Polynomial",
+    "PolynomialProfile",
+    "Prescribed",
+    "Reach",
+    "Rectangular",
+    "Rod",
+    "Scene",
+    "SceneFile",
+    "Sensitivity",
+    "SolveError",
+    "Spline",
+    "SplineProfile",
+    "Status",
+    "StrainDependent",
+    "Sweep",
+    "Taper",
+    "Tendon",
+    "Thread",
+    "TipWrench",
+    "Trigonometric",
+    "actuation_matrix",
+    "annotate",
+    "check",
+    "compliance",
+    "compliance_ellipsoid",
+    "constraint",
+    "design",
+    "film",
+    "follow_branch",
+    "jacobian",
+    "load",
+    "manipulability",
+    "objective",
+    "parameters",
+    "plan",
+    "plot",
+    "plot_design",
+    "reach",
+    "save",
+    "se3",
+    "sensitivity",
+    "solve",
+    "step_twist",
+    "stiffness_matrix",
+    "sweep",
+    "tip_jacobian",
+    "zanna_step",
+]
 
-_LATER = {"Continuum": "continuum", "Design": "optimize", "design": "optimize"}
-"""Where names lie that only some programs need: diffrax and optax take a third of the import time."""
+_LATER = {
+    "Continuum": "models.continuum",
+    "Design": "optimization.design_search",
+    "annotate": "viz.annotate",
+    "design": "optimization.design_search",
+    "film": "viz.animation",
+    "plot": "viz.plot",
+    "plot_design": "viz.plot_design",
+}
+"""Modules of the names that only some programs need: diffrax, optax and matplotlib take longer to
+import than all the rest."""
 
 
 def __getattr__(name: str) -> Any:
-    if name in _LATER:
-        return getattr(import_module(f".{_LATER[name]}", __name__), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name not in _LATER:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module = import_module(f".{_LATER[name]}", __name__)
+    return module if _LATER[name].endswith(f".{name}") else getattr(module, name)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

@@ -1,0 +1,89 @@
+"""Numbers of a scene by name: what they are called, their units, and that a change reaches the
+scene."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vsr_jax as vsr
+from vsr_jax.arm.scene_numbers import matching, replaced
+
+
+@pytest.fixture(scope="module")
+def scene():
+    sections = vsr.Joined((0.1,), [vsr.Circular(vsr.Taper(0.012, 0.01)), vsr.Annular(0.01, 0.002)])
+    arm = vsr.Rod(
+        0.3,
+        sections,
+        vsr.Material(8e5, poisson=0.4, density=1000.0),
+        rest_strain=(0, 1.0, 0, 1, 0, 0),
+    )
+    threads = [
+        vsr.Tendon(vsr.Helix(0.005, 1.5), end=0.2),
+        vsr.Tendon(vsr.Spline([0, 0.1, 0.3], [0, 0.001, 0.003], [0] * 3)),
+        vsr.Tendon(vsr.Polynomial([0.001, 0.002], [0.0, 0.001, 0.002])),
+    ]
+    return vsr.Scene(
+        arm,
+        threads,
+        [
+            vsr.Gravity(),
+            vsr.DistributedWrench(force=(0, vsr.PolynomialProfile([1.0, 2.0, 3.0]), 0)),
+        ],
+    )
+
+
+def test_names_are_those_of_the_constructors_and_units_follow(scene):
+    known = vsr.parameters(scene)
+    units = {
+        "rod.length": "m",
+        "rod.section.sections[0].radius.base": "m",
+        "rod.section.ends": "m",
+        "rod.material.young": "Pa",
+        "rod.material.poisson": "-",
+        "rod.rest_strain[1]": "1/m",
+        "rod.rest_strain[3]": "-",
+        "actuators[0].routing.angle": "rad",
+        "actuators[0].end": "m",
+        "actuators[1].routing.X": "m",
+        "loads[0].acceleration": "m/s^2",
+        "loads[1].moment[0]": "N",
+    }
+    assert {name: known[name].unit for name in units} == units
+    assert known["actuators[2].routing.z"].entries("z") == [
+        ("z[0]", "m"),
+        ("z[1]", "-"),
+        ("z[2]", "1/m"),
+    ]
+    force = "loads[1].force[1].coefficients"
+    assert [unit for _, unit in known[force].entries(force)] == ["N/m", "N/m/m", "N/m/m^2"]
+
+
+def test_every_number_of_a_scene_has_a_name(scene):
+    import equinox as eqx
+    import jax
+
+    counted = sum(len(parameter.ways) for parameter in vsr.parameters(scene).values())
+    assert counted == len(jax.tree.leaves(eqx.filter(scene, eqx.is_inexact_array)))
+
+
+def test_a_new_value_reaches_the_scene_everywhere_it_is_kept(scene):
+    new = replaced(
+        scene, {"actuators[1].routing.X": jnp.array([0.0, 0.2, 0.3]), "rod.length": jnp.array(0.31)}
+    )
+    assert float(new.rod.length) == 0.31
+    for axis in (new.actuators[1].routing.y, new.actuators[1].routing.z):
+        np.testing.assert_array_equal(axis.X, [0.0, 0.2, 0.3])
+    assert replaced(scene, {}) is scene
+
+
+def test_patterns_and_names_that_nothing_has(scene):
+    known = vsr.parameters(scene)
+    assert matching("actuators[*].routing.y", known) == [
+        "actuators[1].routing.y",
+        "actuators[2].routing.y",
+    ]
+    with pytest.raises(
+        ValueError, match=r"no such number; did you mean 'actuators\[0\].routing.radius'"
+    ):
+        matching("actuators[0].routing.radus", known)

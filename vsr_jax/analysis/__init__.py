@@ -1,0 +1,37 @@
+"""Results that need many solves: derivatives, inverse statics, health, branches of equilibria,
+sweeps.
+
+Must not know optimisers or pictures.
+"""
+
+from .branches import Branch, follow_branch
+from .derivatives import (
+    Ellipsoid,
+    Sensitivity,
+    compliance,
+    compliance_ellipsoid,
+    manipulability,
+    sensitivity,
+    tip_jacobian,
+)
+from .health import Health, check
+from .inverse import Reach, reach
+from .sweeping import Sweep, sweep
+
+__all__ = [
+    "Branch",
+    "Ellipsoid",
+    "Health",
+    "Reach",
+    "Sensitivity",
+    "Sweep",
+    "check",
+    "compliance",
+    "compliance_ellipsoid",
+    "follow_branch",
+    "manipulability",
+    "reach",
+    "sensitivity",
+    "sweep",
+    "tip_jacobian",
+]

@@ -1,0 +1,219 @@
+r"""How a tip moves: with every number of its scene, with its inputs, and with a wrench on it.
+
+Small motions are those of the tip's section in the world's axes, $(\delta\theta, \delta r)$: the
+turn [rad], then the displacement [m]. All are implicit derivatives of the equilibrium.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..arm.loads import TipWrench
+from ..arm.scene import Scene
+from ..arm.scene_numbers import parameters, replaced
+from ..mechanics.balance import chosen_rows, tangent
+from ..numerics import component as c
+from ..solution.equilibrium import Equilibrium
+from ..solution.solver import solve
+from ..typing import Pose
+
+
+class Row(NamedTuple):
+    """One number of a scene, and the tip's motion with it: turn [rad] and displacement [m] by its
+    unit."""
+
+    value: Array
+    unit: str
+    turn: Float[Array, "3"]
+    place: Float[Array, "3"]
+
+
+class Sensitivity(eqx.Module):
+    """The tip's derivative by every number of a scene and by its inputs: `table["rod.length"]` is a
+    `Row`, `print(table)` all of them.
+
+    **Fields:** `names`, `units`; `values`, shape (numbers,); `turn` [rad] and `place` [m] by the
+    number's unit, shape (numbers, 3).
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    units: tuple[str, ...] = eqx.field(static=True)
+    values: Float[Array, " numbers"]
+    turn: Float[Array, "numbers 3"]
+    place: Float[Array, "numbers 3"]
+
+    def __getitem__(self, name: str) -> Row:
+        i = self.names.index(name) if name in self.names else None
+        if i is None:
+            raise KeyError(f"{name!r}: known are {', '.join(self.names)}")
+        return Row(self.values[i], self.units[i], self.turn[i], self.place[i])
+
+    def __str__(self) -> str:
+        width = max(map(len, self.names))
+        lines = [
+            f"{'number':{width}} {'value':>12}  {'unit':7} {'dx':>10} {'dy':>10} {'dz':>10}   mm "
+            f"by 1 %"
+        ]
+        for name, unit, value, place in zip(
+            self.names, self.units, self.values, self.place, strict=True
+        ):
+            share = 10 * abs(float(value)) * float(jnp.linalg.norm(place))
+            steps = " ".join(f"{float(x):10.3g}" for x in place)
+            lines.append(
+                f"{name:{width}} {float(value):12.6g}  {unit or '?':7} {steps} {share:11.3g}"
+            )
+        return "\n".join([*lines, "dx, dy, dz: displacement of the tip [m] by the number's unit"])
+
+
+def sensitivity(eq: Equilibrium) -> Sensitivity:
+    r"""The tip's derivative by every number of the scene and by every input: $(\partial\theta,
+    \partial r) / \partial p$.
+
+    **Arguments:** `eq`: a solved scene, one at a time; NaN where it failed.
+
+    **Returns:** a `Sensitivity`, a table by name with units. Arrays have a row for each of their
+    numbers.
+    """
+    known = parameters(eq.scene)
+    named = [entry for name, parameter in known.items() for entry in parameter.entries(name)]
+    named += [(f"inputs[{i}]", actuator.unit) for i, actuator in enumerate(eq.scene.actuators)]
+    values, turn, place = _by_numbers(eq)
+    return Sensitivity(
+        tuple(name for name, _ in named), tuple(unit for _, unit in named), values, turn, place
+    )
+
+
+@eqx.filter_jit
+def _by_numbers(eq: Equilibrium) -> tuple[Array, Array, Array]:
+    numbers = {name: parameter.value for name, parameter in parameters(eq.scene).items()}
+
+    def motion(numbers: dict[str, Array], inputs: Array) -> Array:
+        return _motion(solve(replaced(eq.scene, numbers), inputs, model=eq.model).tip, eq.tip)
+
+    by_numbers, by_inputs = jax.jacrev(motion, argnums=(0, 1))(numbers, eq.inputs)
+    rows = jnp.concatenate(
+        [*(by_numbers[name].reshape(6, -1) for name in numbers), by_inputs], axis=1
+    ).T
+    values = jnp.concatenate([*(x.reshape(-1) for x in numbers.values()), eq.inputs])
+    return values, eq._mask(rows[:, :3]), eq._mask(rows[:, 3:])
+
+
+def _motion(tip: Pose, here: Pose) -> Float[Array, "6"]:
+    """Turn and displacement from a pose nearby, to first order, in the world's axes."""
+    turn = tip[:3, :3] @ jax.lax.stop_gradient(here)[:3, :3].T
+    axis = 0.5 * jnp.stack(
+        [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
+    )
+    return jnp.concatenate([axis, tip[:3, 3] - jax.lax.stop_gradient(here)[:3, 3]])
+
+
+def tip_jacobian(eq: Equilibrium) -> Float[Array, "6 inputs"]:
+    r"""The tip's derivative by the inputs, $J = (\partial\theta, \partial r) / \partial u$, turn
+    first, in the world's axes.
+
+    **Arguments:** `eq`: a solved scene, one at a time; NaN where it failed.
+
+    **Returns:** shape (6, inputs) [rad and m by the actuators' units].
+    """
+    return _by_inputs(eq)
+
+
+@eqx.filter_jit
+def _by_inputs(eq: Equilibrium) -> Array:
+    return eq._mask(
+        jax.jacfwd(lambda inputs: _motion(solve(eq.scene, inputs, model=eq.model).tip, eq.tip))(
+            eq.inputs
+        )
+    )
+
+
+def compliance(eq: Equilibrium) -> Float[Array, "6 6"]:
+    r"""What a small dead wrench on the tip moves it by: $(\delta\theta, \delta r) = C (\delta M,
+    \delta F)$, in the world's axes.
+
+    Without loads $C = \int G^T (\Sigma - A)^{-1} G \, dX$, where G carries the wrench to the
+    sections, for models that are `balanced_everywhere`. With loads, given lengths or friction, and
+    for all other models, the derivative of the solve with one more `TipWrench`.
+
+    **Arguments:** `eq`: a solved scene, one at a time; NaN where it failed.
+
+    **Returns:** shape (6, 6) [rad and m by N m and N]; symmetric where the loads have a potential.
+    """
+    return _compliance(eq)
+
+
+@eqx.filter_jit
+def _compliance(eq: Equilibrium) -> Array:
+    if eq.scene.coupled or not eq.model.balanced_everywhere:
+        return eq._mask(
+            jax.jacfwd(lambda wrench: _motion(_pushed(eq, wrench).tip, eq.tip))(
+                jnp.zeros(6, eq.inputs.dtype)
+            )
+        )
+    nodes, free = eq._nodes(), jnp.array(eq.scene.free)
+    rows = tangent(nodes.xi, nodes.sections, nodes.tau(eq._sound_forces))
+    H = c.join_matrix(c.symmetric(chosen_rows(rows, eq.scene.free))).reshape(
+        -1, free.size, free.size
+    )
+    poses = eq._poses(nodes.grid.X.reshape(-1))
+    G = jax.vmap(lambda g: _carried(g, eq.tip))(poses)[:, free]
+    weight = jnp.broadcast_to(nodes.grid.weight, nodes.grid.X.shape).reshape(-1)
+    return eq._mask(jnp.einsum("x,xai,xaj->ij", weight, G, jnp.linalg.solve(H, G)))
+
+
+def _pushed(eq: Equilibrium, wrench: Float[Array, "6"]) -> Equilibrium:
+    """The arm with one more wrench on its tip."""
+    loads = (*eq.scene.loads, TipWrench(wrench[3:], wrench[:3]))
+    scene = Scene(eq.scene.rod, eq.scene.actuators, loads, free_strains=eq.scene.free_strains)
+    return solve(scene, eq.inputs, model=eq.model)
+
+
+def _carried(g: Pose, tip: Pose) -> Float[Array, "6 6"]:
+    """Wrench in a section's frame from one on the tip in the world's axes."""
+    turned = g[:3, :3].T
+    arm = tip[:3, 3] - g[:3, 3]
+    moment = jnp.concatenate([turned, turned @ c.join_matrix(c.skew(c.split(arm)))], axis=1)
+    return jnp.concatenate([moment, jnp.concatenate([jnp.zeros_like(turned), turned], axis=1)])
+
+
+class Ellipsoid(NamedTuple):
+    """An ellipsoid in space: `centre` [m] and half `axes`, the columns of a matrix, the longest
+    first."""
+
+    centre: Float[Array, "3"]
+    axes: Float[Array, "3 3"]
+
+    @property
+    def measure(self) -> Array:
+        """Product of the half axes; 0 where it is flat."""
+        return jnp.prod(c.norm(c.split(self.axes.T)))
+
+
+def ellipsoid(matrix: Float[Array, "3 columns"], centre: Float[Array, "3"]) -> Ellipsoid:
+    r"""Where $A x$ gets for $|x| \le 1$, about a centre."""
+    U, lengths, _ = jnp.linalg.svd(matrix, full_matrices=True)
+    lengths = jnp.zeros(3, lengths.dtype).at[: lengths.size].set(lengths)
+    return Ellipsoid(centre, U * lengths)
+
+
+def manipulability(eq: Equilibrium, scale: float | Array = 1.0) -> Ellipsoid:
+    r"""Manipulability ellipsoid: displacements of the tip by changes of the inputs with $\sum_i
+    (\delta u_i / s_i)^2 \le 1$.
+
+    Its `measure` is Yoshikawa's, $\sqrt{\det J J^T}$ for $J$ scaled, 0 for fewer than three inputs.
+
+    **Arguments:** `eq`: a solved scene; `scale`: $s$, one number or one an actuator, in their
+    units.
+
+    **Source:** T. Yoshikawa, Manipulability of Robotic Mechanisms, Int. J. Robotics Research 4
+    (1985).
+    """
+    return ellipsoid(tip_jacobian(eq)[3:] * scale, eq.tip[:3, 3])
+
+
+def compliance_ellipsoid(eq: Equilibrium, force: float | Array = 1.0) -> Ellipsoid:
+    """Displacements of the tip by forces on it of at most `force` [N] in any direction."""
+    return ellipsoid(compliance(eq)[3:, 3:] * force, eq.tip[:3, 3])

@@ -1,0 +1,229 @@
+"""Names, units and descriptions in the store of a sweep: dimensions, coordinates and attributes as
+xarray shows them."""
+
+from collections.abc import Mapping
+from contextlib import suppress
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from ..arm.rod import STRAINS
+from ..arm.scene import Scene
+from ..files.scene_file import to_toml
+from ..models.base import Model, Status
+from ..models.basis import Basis
+from ..models.prescribed import Prescribed
+from ..models.strain_dependent import StrainDependent
+from .sweep_program import Task, number
+
+
+class Label(NamedTuple):
+    """Names of an array's dimensions, and its attributes."""
+
+    dims: tuple[str, ...]
+    attributes: dict[str, Any]
+
+
+class Labels(NamedTuple):
+    """What a store holds besides samples and outputs: a label for each array, the values of the
+    coordinates, attributes."""
+
+    arrays: dict[str, Label]
+    coordinates: dict[str, np.ndarray]
+    attributes: dict[str, Any]
+
+
+class _Coordinate(NamedTuple):
+    dim: str
+    long_name: str
+    values: np.ndarray
+
+
+_QUANTITIES = {
+    "tip": (
+        ("row", "column"),
+        "see column_units",
+        "pose of the tip, axes of its section and position",
+    ),
+    "lengths": (("actuator",), "m", "length of the thread's path"),
+    "forces": (
+        ("actuator",),
+        "N",
+        "signed force of the thread at its start, negative for a tendon",
+    ),
+    "slack": (("actuator",), "m", "length of cable that hangs loose"),
+    "stability": (
+        (),
+        "1",
+        "stability margin, the least eigenvalue of the scaled tangent stiffness",
+    ),
+    "condition": ((), "1", "condition number of the scaled tangent stiffness"),
+    "q": (("dof",), "see dof_units", "coordinates of the strain in the model's basis"),
+    "steps": ((), "1", "steps of the solver"),
+}
+"""Dimensions besides the samples, unit and description of the outputs known by name."""
+
+_FORCES_AS_Q = (
+    ("actuator",),
+    "N",
+    "coordinates of the strain in the model's basis: the thread forces",
+)
+
+_STATUS = {
+    "long_name": "how the solve ended",
+    "flag_values": [int(status) for status in Status],
+    "flag_meanings": " ".join(status.name.lower() for status in Status),
+}
+
+_POSE = {
+    "row": _Coordinate(
+        "row",
+        "component in the world frame, w: last row of the homogeneous matrix",
+        np.array(["x", "y", "z", "w"]),
+    ),
+    "column": _Coordinate(
+        "column",
+        "axis of the tip's section, or its position",
+        np.array(["axis_x", "axis_y", "axis_z", "position"]),
+    ),
+    "column_units": _Coordinate(
+        "column", "unit of each column of the pose", np.array(["1", "1", "1", "m"])
+    ),
+}
+
+
+def labels(
+    task: Task, like: Mapping[str, Any], samples: Any, flat: Mapping[str, np.ndarray]
+) -> Labels:
+    """Labels of a sweep's store.
+
+    **Arguments:** the task; shapes and dtypes of its outputs; all samples, as a pytree and as
+    arrays by name.
+
+    **Raises:** `ValueError` for an output with the name of a dimension or coordinate, or with a
+    slash in its name.
+    """
+    scene, inputs = eqx.filter_eval_shape(_given, task, jax.tree.map(lambda x: x[0], samples))
+    model = StrainDependent() if task.model is None else task.model
+    named = () if callable(task.outputs) else task.outputs
+    coordinates = (
+        _actuators(scene)
+        | (_POSE if "tip" in named else {})
+        | (_dofs(model, like["q"].shape[1]) if "q" in named else {})
+    )
+    arrays = {
+        name: _sample(name, x, isinstance(task.scene, Scene), coordinates)
+        for name, x in flat.items()
+    }
+    arrays |= {name: _output(name, x, name in named, coordinates) for name, x in like.items()}
+    _check_names(like, {*coordinates, *(dim for label in arrays.values() for dim in label.dims)})
+    arrays |= {name: Label((c.dim,), {"long_name": c.long_name}) for name, c in coordinates.items()}
+    values = {name: c.values for name, c in coordinates.items()}
+    return Labels(arrays, values, _attributes(task, model, number(samples), inputs.dtype))
+
+
+def _given(task: Task, sample: Any) -> tuple[Scene, Any]:
+    scene, inputs = task.given(sample)
+    return scene, scene.check_inputs(inputs)
+
+
+def _actuators(scene: Scene) -> dict[str, _Coordinate]:
+    kinds, units = [type(a).__name__ for a in scene.actuators], [a.unit for a in scene.actuators]
+    return {
+        "actuator": _Coordinate(
+            "actuator", "place in scene.actuators", np.arange(len(scene.actuators))
+        ),
+        "actuator_type": _Coordinate("actuator", "class of the actuator", np.array(kinds, str)),
+        "input_units": _Coordinate(
+            "actuator", "unit of the actuator's input", np.array(units, str)
+        ),
+    }
+
+
+def _dofs(model: Model, size: int) -> dict[str, _Coordinate]:
+    """Names and units of the coordinates q; none for `StrainDependent`, whose coordinates are the
+    thread forces."""
+    if isinstance(model, StrainDependent):
+        return {}
+    names, units = [f"q_{i}" for i in range(size)], ["unknown"] * size
+    if isinstance(model, Prescribed) and isinstance(model.basis, Basis):
+        families = model.basis.families
+        strains = [
+            (name, i) for name in STRAINS if name in families for i in range(families[name].size)
+        ]
+        names = [f"{name}_{i}" for name, i in strains]
+        units = ["1/m" if STRAINS.index(name) < 3 else "1" for name, _ in strains]
+    return {
+        "dof": _Coordinate("dof", "strain, and place in its family of functions", np.array(names)),
+        "dof_units": _Coordinate("dof", "unit of each coordinate", np.array(units)),
+    }
+
+
+def _sample(
+    name: str, x: np.ndarray, inputs: bool, coordinates: Mapping[str, _Coordinate]
+) -> Label:
+    if not inputs:
+        return _labelled(_numbered(name, x.ndim), {"long_name": f"samples, {name}"}, coordinates)
+    units = sorted(set(coordinates["input_units"].values.tolist()))
+    attributes = {
+        "long_name": "inputs of the actuators",
+        "units": units[0] if len(units) == 1 else "see input_units",
+    }
+    return _labelled(("sample", "actuator"), attributes, coordinates)
+
+
+def _output(name: str, x: Any, named: bool, coordinates: Mapping[str, _Coordinate]) -> Label:
+    if name == "status":
+        return Label(("sample",), _STATUS)
+    if not named:
+        return _labelled(
+            _numbered(name, len(x.shape)),
+            {"long_name": f"output {name} of the function given to the sweep"},
+            coordinates,
+        )
+    dims, unit, long_name = (
+        _FORCES_AS_Q if name == "q" and "dof" not in coordinates else _QUANTITIES[name]
+    )
+    return _labelled(("sample", *dims), {"long_name": long_name, "units": unit}, coordinates)
+
+
+def _numbered(name: str, ndim: int) -> tuple[str, ...]:
+    return ("sample", *(f"{name}_dim_{axis}" for axis in range(1, ndim)))
+
+
+def _labelled(
+    dims: tuple[str, ...], attributes: dict[str, Any], coordinates: Mapping[str, _Coordinate]
+) -> Label:
+    """A label that names the coordinates that are no index, after the CF conventions."""
+    more = [
+        name
+        for name, coordinate in coordinates.items()
+        if coordinate.dim in dims and coordinate.dim != name
+    ]
+    return Label(dims, attributes | ({"coordinates": " ".join(more)} if more else {}))
+
+
+def _check_names(outputs: Mapping[str, Any], taken: set[str]) -> None:
+    for name in outputs:
+        if name in taken or "/" in name:
+            raise ValueError(
+                f"sweep.outputs: got {name!r}, need for a store a name without / and none of "
+                f"{', '.join(sorted(taken))}"
+            )
+
+
+def _attributes(task: Task, model: Model, samples: int, dtype: Any) -> dict[str, Any]:
+    from .. import __version__
+
+    attributes = {
+        "title": f"Equilibria of a soft manipulator, {samples} samples",
+        "source": f"vsr_jax {__version__}",
+        "model": eqx.tree_pformat(model, width=100_000, short_arrays=False),
+        "precision": str(dtype),
+    }
+    if isinstance(task.scene, Scene):
+        with suppress(ValueError):  # a scene with Python functions has no file
+            attributes["scene"] = to_toml(task.scene)
+    return attributes

@@ -1,0 +1,236 @@
+"""Many equilibria at once: any number of samples, in chunks, over all devices and processes, to
+memory or to disk."""
+
+import os
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, TypeAlias
+
+import jax
+import numpy as np
+from jax.sharding import Mesh
+from tqdm import tqdm
+
+from ..arm.scene import Scene
+from ..models.base import Model, Status
+from ..numerics.fingerprint import fingerprint
+from ..solution.equilibrium import Equilibrium
+from ..validation import count
+from .sweep_labels import labels
+from .sweep_program import Program, Task, number
+from .sweep_store import Archive, InMemory
+
+OUTPUTS = ("tip", "lengths", "forces", "slack", "stability", "condition", "q", "steps")
+"""Quantities of an `Equilibrium` that a sweep knows by name."""
+
+_CHUNK = 16_384
+_MEMORY = 1 << 30
+
+Outputs: TypeAlias = str | Sequence[str] | Callable[[Equilibrium], Mapping[str, Any]]
+
+
+class Sweep(Mapping[str, Any]):
+    """Outcome of a sweep: a mapping from the names of its outputs to arrays whose first axis is
+    that of the samples.
+
+    **Fields:** `status`, a `Status` as an integer for each sample; the outputs are NaN where it is
+    not converged. The arrays are NumPy's, or, of a sweep to disk, Zarr's, which read what is asked
+    for, as in `result["tip"][:100]`.
+    """
+
+    def __init__(self, arrays: Mapping[str, Any]):
+        self._arrays = {name: array for name, array in arrays.items() if name != "status"}
+        self.status = arrays["status"]
+
+    def __getitem__(self, name: str) -> Any:
+        return self._arrays[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._arrays)
+
+    def __len__(self) -> int:
+        return len(self._arrays)
+
+    @property
+    def converged(self) -> np.ndarray:
+        """Whether each sample is an equilibrium."""
+        return np.asarray(self.status) == Status.CONVERGED
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many samples ended with each status, by its name."""
+        values, numbers = np.unique(np.asarray(self.status), return_counts=True)
+        return {
+            Status(int(value)).name.lower(): int(number)
+            for value, number in zip(values, numbers, strict=True)
+        }
+
+    def __repr__(self) -> str:
+        said = ", ".join(f"{number} {status}" for status, number in self.counts.items())
+        return (
+            f"Sweep({said}; {', '.join(f'{name} {array.shape}' for name, array in self.items())})"
+        )
+
+
+def sweep(
+    scene: Scene | Callable[[Any], tuple[Scene, Any]],
+    inputs: Any,
+    *,
+    outputs: Outputs = "tip",
+    model: Model | None = None,
+    out: str | os.PathLike | None = None,
+    chunk: int | None = None,
+    memory: int = _MEMORY,
+    devices: Sequence[Any] | None = None,
+    progress: bool = True,
+) -> Sweep:
+    """Equilibria of many inputs, or of many scenes.
+
+        # tensions: (samples, actuators)
+        tips = vsr.sweep(scene, tensions)["tip"] vsr.sweep(lambda s: (arm(s["radius"]),
+        s["tensions"]), {"radius": radii, "tensions": tensions}, out="designs.zarr")
+
+    One compiled program solves chunk after chunk, a part on each device. Where several processes
+    share a `jax.distributed` runtime, each calls this and takes its share of the chunks. No sample
+    changes another; one that fails says so in its status.
+
+    **Arguments:**
+    - `scene`: a scene, or a function from one sample to a scene and the inputs of its actuators.
+    - `inputs`: the samples, shape (samples, actuators); for a function any pytree of arrays whose
+      first axis is the samples.
+    - `outputs`: names among `tip`, `lengths`, `forces`, `slack`, `stability`, `condition`, `q` and
+      `steps`, or a function from an `Equilibrium` to arrays by name; only what is asked for is
+      computed.
+    - `model`: as for `solve`.
+    - `out`: a folder for Zarr (`pip install "vsr-jax[sweep]"`), which `xarray.open_zarr` reads: see
+      below. Each chunk is written when it is done. The same call resumes a sweep that was killed,
+      and reads one that has finished; results are bit-identical on the same devices.
+    - `chunk`: samples in a chunk, 16,384 by default, of which other devices than CPUs get one each;
+      a folder keeps its own.
+    - `memory`: bound [bytes] on the intermediate values of the compiled program, by which fewer
+      samples are solved side by side.
+    - `devices`: those of this process that take part, all by default.
+    - `progress`: whether to show a bar with rate and remaining time.
+
+    **The store:** `tip` has the dimensions (sample, row, column), `inputs`, `lengths`, `forces` and
+    `slack` (sample, actuator), `q` (sample, dof), or (sample, actuator) where it is the thread
+    forces; outputs of a function have (sample, NAME_dim_1, ...), and so have the samples given to a
+    function of the scene. Units are attributes, or coordinates where they differ: `input_units`,
+    `column_units`, `dof_units`. `data.tip.sel(column="position", row=["x", "y", "z"])` is the tip's
+    place. The attributes hold the model, the precision, the version and, as TOML, a scene that has
+    no Python functions.
+
+    Every chunk has a checksum (CRC-32C). Each call reads all chunks once to verify them, which
+    takes little time compared to solving them; what is missing or damaged is computed again, with
+    one warning. One sweep at a time writes to a folder.
+
+    **Returns:** a `Sweep`, whole in every process.
+
+    **Raises:** `ValueError` for samples of a wrong shape or of different numbers, an unknown
+    output, a bound on memory that not even one sample keeps, an `out` that holds something else or
+    whose metadata are damaged, or one to which another sweep is writing; `ImportError` where Zarr
+    is missing.
+
+    **Warns:** `UserWarning` where chunks in `out` are missing or damaged, with their names and
+    samples.
+    """
+    task = Task(scene, model, _named(outputs))
+    samples = _samples(scene, inputs)
+    total = number(samples)
+    like = jax.eval_shape(jax.vmap(lambda sample: task(sample)), samples)
+    local = Mesh(np.array(jax.local_devices() if devices is None else list(devices)), ("samples",))
+    size = min(_chunk(local) if chunk is None else count("sweep.chunk", chunk), total)
+    archive = InMemory(like, size) if out is None else _archive(out, task, like, samples, size)
+    missing = archive.missing(
+        range(jax.process_index(), -(-total // archive.chunk), jax.process_count())
+    )
+    with archive.writing():
+        if missing:
+            program = Program(task, samples, archive.chunk, local, count("sweep.memory", memory))
+            _run(program, missing, archive, progress and jax.process_index() == 0)
+    return Sweep(archive.arrays())
+
+
+def _run(program: Program, chunks: list[int], archive: InMemory | Archive, progress: bool) -> None:
+    """Solves chunks, each while the one before is written."""
+    failed, before = 0, None
+    with tqdm(
+        total=sum(map(program.samples_in, chunks)),
+        unit=" shapes",
+        unit_scale=True,
+        disable=not progress,
+    ) as bar:
+        for index in [*chunks, None]:
+            now = None if index is None else (index, program(index))
+            if before is not None:
+                done, outputs = before
+                size = program.samples_in(done)
+                arrays = {name: np.asarray(x)[:size] for name, x in outputs.items()}
+                archive.write(done, arrays)
+                failed += np.count_nonzero(arrays["status"] != Status.CONVERGED)
+                bar.set_postfix(failed=failed, refresh=False)
+                bar.update(size)
+            before = now
+
+
+def _chunk(devices: Mesh) -> int:
+    return _CHUNK if devices.devices.flat[0].platform == "cpu" else _CHUNK * devices.devices.size
+
+
+def _named(outputs: Outputs) -> tuple[str, ...] | Callable:
+    if callable(outputs):
+        return outputs
+    names = (outputs,) if isinstance(outputs, str) else tuple(outputs)
+    unknown = [name for name in names if name not in OUTPUTS]
+    if unknown:
+        raise ValueError(
+            f"sweep.outputs: got {', '.join(map(repr, unknown))}, need some of "
+            f"{', '.join(OUTPUTS)}, or a function"
+        )
+    return names
+
+
+def _samples(scene: Scene | Callable, inputs: Any) -> Any:
+    """The samples as NumPy arrays in the dtype JAX gives them."""
+    samples = jax.tree.map(
+        lambda x: np.asarray(x, jax.dtypes.canonicalize_dtype(np.asarray(x).dtype)), inputs
+    )
+    if isinstance(scene, Scene):
+        samples = np.asarray(samples)
+        if samples.ndim != 2 or samples.shape[1] != len(scene.actuators):
+            raise ValueError(
+                f"sweep.inputs: got shape {samples.shape}, need (samples, "
+                f"{len(scene.actuators)}), a row for each sample"
+            )
+        if not np.issubdtype(samples.dtype, np.floating):
+            samples = samples.astype(jax.dtypes.canonicalize_dtype(float))
+    elif not callable(scene):
+        raise ValueError(
+            f"sweep.scene: got {scene!r}, need a Scene, or a function from a sample to a Scene "
+            f"and its inputs"
+        )
+    numbers = {name: x.shape[:1] for name, x in _flat(samples).items()}
+    if len(set(numbers.values())) != 1 or min(numbers.values()) in ((), (0,)):
+        said = ", ".join(f"{name} {shape}" for name, shape in numbers.items())
+        raise ValueError(
+            f"sweep.inputs: got {said or 'no array'}, need arrays with one first axis, that of "
+            f"the samples, at least one"
+        )
+    return samples
+
+
+def _flat(samples: Any) -> dict[str, np.ndarray]:
+    """The samples by name: `inputs`, or with the places in their tree, as in `inputs_radius`."""
+    leaves = jax.tree_util.tree_flatten_with_path(samples)[0]
+    return {
+        "_".join(["inputs", *re.findall(r"\w+", jax.tree_util.keystr(path))]): x
+        for path, x in leaves
+    }
+
+
+def _archive(
+    out: str | os.PathLike, task: Task, like: Mapping[str, Any], samples: Any, chunk: int
+) -> Archive:
+    flat = _flat(samples)
+    digest = fingerprint(task, (jax.tree.map(lambda x: x[0], samples),), samples)
+    return Archive(out, like, flat, chunk, labels(task, like, samples, flat), digest)

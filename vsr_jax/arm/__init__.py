@@ -1,0 +1,63 @@
+"""What an arm is made of: profiles, sections, materials, routings, actuators, loads, the rod, and
+the scene that joins them.
+
+Data and their geometry only. Must not know how an equilibrium is found, nor how a scene is stored.
+"""
+
+from .actuator import Actuator, Chamber, Tendon, Thread
+from .loads import DistributedWrench, Frame, Gravity, Load, PointWrench, TipWrench
+from .material import Material
+from .profile import (
+    Constant,
+    FunctionProfile,
+    Piecewise,
+    PolynomialProfile,
+    Profile,
+    SplineProfile,
+    Taper,
+)
+from .rod import STRAINS, Rod
+from .routing import Function, Helix, Linear, Parallel, Polynomial, Routing, Spline
+from .scene import CrossSections, Scene
+from .scene_numbers import Parameter, parameters
+from .section import Annular, Circular, Elliptic, Joined, Rectangular, Section
+
+__all__ = [
+    "STRAINS",
+    "Actuator",
+    "Annular",
+    "Chamber",
+    "Circular",
+    "Constant",
+    "CrossSections",
+    "DistributedWrench",
+    "Elliptic",
+    "Frame",
+    "Function",
+    "FunctionProfile",
+    "Gravity",
+    "Helix",
+    "Joined",
+    "Linear",
+    "Load",
+    "Material",
+    "Parallel",
+    "Parameter",
+    "Piecewise",
+    "PointWrench",
+    "Polynomial",
+    "PolynomialProfile",
+    "Profile",
+    "Rectangular",
+    "Rod",
+    "Routing",
+    "Scene",
+    "Section",
+    "Spline",
+    "SplineProfile",
+    "Taper",
+    "Tendon",
+    "Thread",
+    "TipWrench",
+    "parameters",
+]

@@ -1,0 +1,201 @@
+"""Actuators: what an input means as the paper's signed thread force $\\tau$ (negative pulls,
+positive pushes)."""
+
+from abc import abstractmethod
+from typing import Any, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from ..typing import Scalar
+from ..validation import choice, concrete, instance, numbers
+from .routing import Routing
+
+
+class Actuator(eqx.Module):
+    """A thread laid along a routing and driven by one input.
+
+    **Arguments shared by all:**
+    - `routing`: the thread's path.
+    - `start`, `end`: where on the arm it is anchored [m], by default the arm's base and tip. It
+      acts between them only.
+    """
+
+    routing: eqx.AbstractVar[Routing]
+    start: eqx.AbstractVar[Scalar | None]
+    end: eqx.AbstractVar[Scalar | None]
+    effect: eqx.AbstractClassVar[str]
+
+    @property
+    @abstractmethod
+    def unit(self) -> str:
+        """Unit of the input."""
+
+    @property
+    def lowest(self) -> float:
+        """The least input it can take."""
+        return float("-inf")
+
+    @abstractmethod
+    def force(self, value: Scalar) -> Scalar:
+        """Signed thread force $\\tau$ [N] for an input."""
+
+    def admits(self, value: Scalar) -> Bool[Array, ""]:
+        """Whether the input is one this actuator can exert: finite and in its range."""
+        return jnp.isfinite(value) & (value >= self.lowest)
+
+    @property
+    def breakpoints(self) -> tuple[Scalar, ...]:
+        """Abscissas [m] where the path, a derivative of it or the thread's force jumps."""
+        ends = tuple(x for x in (self.start, self.end) if x is not None)
+        return (*self.routing.breakpoints, *ends)
+
+    def reach(self, X: Scalar) -> Array | None:
+        """1 where the thread lies, 0 beyond its ends; None for one that runs along the whole
+        arm."""
+        if self.start is None and self.end is None:
+            return None
+        here = jnp.ones_like(X)
+        if self.start is not None:
+            here = jnp.where(self.start <= X, here, 0.0)
+        return here if self.end is None else jnp.where(self.end > X, here, 0.0)
+
+
+def _laid(
+    actuator: str, routing: Any, start: Any, end: Any
+) -> tuple[Routing, Scalar | None, Scalar | None]:
+    needed = "a routing such as Parallel, Linear, Helix, Polynomial, Spline or Function"
+    path = instance(f"{actuator}.routing", routing, Routing, needed)
+    first = None if start is None else numbers(f"{actuator}.start", start, least=0.0)
+    last = None if end is None else numbers(f"{actuator}.end", end, positive=True)
+    if first is not None and last is not None:
+        known = concrete(first), concrete(last)
+        if known[0] is not None and known[1] is not None and not known[0] < known[1]:
+            raise ValueError(
+                f"{actuator}.end: got end = {known[1]:g} m and start = {known[0]:g} m, need an "
+                f"end beyond the start"
+            )
+    return path, first, last
+
+
+class Thread(Actuator):
+    """The paper's actuator: the input is $\\tau$ itself [N], negative for a tendon, positive for a
+    fluidic chamber."""
+
+    routing: Routing
+    start: Scalar | None
+    end: Scalar | None
+    effect = "threads"
+
+    def __init__(self, routing: Routing, *, start: Any = None, end: Any = None):
+        self.routing, self.start, self.end = _laid("Thread", routing, start, end)
+
+    @property
+    def unit(self) -> str:
+        return "N"
+
+    def force(self, value: Scalar) -> Scalar:
+        return value
+
+
+class Tendon(Actuator):
+    r"""A cable that can only pull, driven by its tension or by its length.
+
+    With `control="tension"` the input is $T \ge 0$ [N] and $\tau = -T$. With `control="length"` the
+    input is the change $\delta$ [m] of the cable between its ends, negative when the motor takes
+    cable in, and the tension is found:
+
+    $$T \ge 0, \quad (l^* + \delta)(1 + T / k) - l \ge 0, \quad \text{one of the two is zero},$$
+
+    with $l^*$ the length of the path at rest, $l$ that of the deformed arm and $k$ the cable's
+    axial stiffness $EA$ (infinite by default).
+
+    With friction the tension decays with the turning angle $\varphi$ of the cable from its start,
+    $T(X) = T e^{\mp \mu \varphi(X)}$ (the capstan equation): minus while the motor pulls, plus
+    while it releases. The angle counts the kinks of the path: corners of its routing, and places
+    where the strain jumps, as where another tendon ends. There it converges by the order of the
+    nodes of a step, third for steps of order 6. The input and the tension found are those at the
+    start.
+
+    **Arguments:**
+    - `routing`, `start`, `end`: as for every actuator.
+    - `control`: `"tension"` or `"length"`.
+    - `stiffness`: $k$ [N], for `control="length"` only.
+    - `friction`: coefficient $\mu$ [-], none by default.
+    - `motion`: `"pull"` or `"release"`, the direction in which friction acts.
+    """
+
+    routing: Routing
+    start: Scalar | None
+    end: Scalar | None
+    stiffness: Scalar | None
+    friction: Scalar | None
+    control: Literal["tension", "length"] = eqx.field(static=True)
+    motion: Literal["pull", "release"] = eqx.field(static=True)
+    effect = "tendons"
+
+    def __init__(
+        self,
+        routing: Routing,
+        *,
+        start: Any = None,
+        end: Any = None,
+        control: Literal["tension", "length"] = "tension",
+        stiffness: Any = None,
+        friction: Any = None,
+        motion: Literal["pull", "release"] = "pull",
+    ):
+        self.routing, self.start, self.end = _laid("Tendon", routing, start, end)
+        self.control = choice("Tendon.control", control, ("tension", "length"))
+        if stiffness is not None and control == "tension":
+            raise ValueError(
+                "Tendon.stiffness: got a stiffness with control='tension', need control='length' "
+                "(a given tension needs none)"
+            )
+        self.stiffness = (
+            None if stiffness is None else numbers("Tendon.stiffness", stiffness, positive=True)
+        )
+        self.friction = (
+            None if friction is None else numbers("Tendon.friction", friction, least=0.0)
+        )
+        self.motion = choice("Tendon.motion", motion, ("pull", "release"))
+
+    @property
+    def unit(self) -> str:
+        return "N" if self.control == "tension" else "m"
+
+    @property
+    def lowest(self) -> float:
+        return 0.0 if self.control == "tension" else float("-inf")
+
+    def force(self, value: Scalar) -> Scalar:
+        """$\\tau = -T$; a tendon driven by its length starts from none."""
+        return -value if self.control == "tension" else jnp.zeros_like(value)
+
+
+class Chamber(Actuator):
+    """A slender fluidic chamber: the input is the gauge pressure $p$ [Pa], $\\tau = p a$.
+
+    **Arguments:**
+    - `routing`: the chamber's centre line.
+    - `area`: the chamber's bore $a$ [m^2], positive. A negative pressure is a vacuum.
+    - `start`, `end`: as for every actuator.
+    """
+
+    routing: Routing
+    area: Scalar
+    start: Scalar | None
+    end: Scalar | None
+    effect = "chambers"
+
+    def __init__(self, routing: Routing, area: Any, *, start: Any = None, end: Any = None):
+        self.routing, self.start, self.end = _laid("Chamber", routing, start, end)
+        self.area = numbers("Chamber.area", area, positive=True)
+
+    @property
+    def unit(self) -> str:
+        return "Pa"
+
+    def force(self, value: Scalar) -> Scalar:
+        return value * self.area

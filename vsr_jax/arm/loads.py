@@ -1,0 +1,190 @@
+r"""External loads: wrenches per length along the arm and wrenches at points of it, dead or
+following.
+
+A load is given in the world frame (dead: it keeps its direction) or in the body frame (follower: it
+turns with the section it acts on). Wrenches are angular first, $(c, f)$ [N m/m, N/m] per unit of
+reference length and $(M, F)$ [N m, N] at a point, moments about the point of the axis where the
+load acts.
+"""
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..numerics.component import Vector, split
+from ..typing import Scalar
+from ..validation import choice, numbers
+from .profile import FunctionOfX, Profile, as_profile
+from .rod import Rod
+
+Frame = Literal["world", "body"]
+
+
+class Load(eqx.Module):
+    """A load on the arm: a wrench per length, or a wrench at a point, in the frame it keeps."""
+
+    frame: eqx.AbstractVar[Frame]
+    effect: eqx.AbstractClassVar[str]
+
+    def density(self, rod: Rod, X: Scalar) -> Vector | None:
+        """Wrench per length $(c, f)$ at X, six scalars; None for a load at a point."""
+        return None
+
+    def point(self, rod: Rod) -> tuple[Scalar, Vector] | None:
+        """Where a load at a point acts [m] and its wrench $(M, F)$; None for a load along the
+        arm."""
+        return None
+
+    def breakpoints(self, rod: Rod) -> tuple[Scalar, ...]:
+        """Abscissas [m] where the load or a derivative of it jumps."""
+        return ()
+
+
+class Gravity(Load):
+    r"""Weight less buoyancy: $f = (\rho - \rho_f) A g$ per length, in the world frame.
+
+    **Arguments:**
+    - `acceleration`: $g$ [m/s^2] in the world frame, (0, 0, -9.81) by default.
+    - `fluid_density`: $\rho_f$ [kg/m^3] of a fluid around the arm, 0 by default. The arm is taken
+      as wet all round, its tip included, so that every slice is buoyed up by what it displaces at
+      rest.
+
+    The rod's material needs a `density`.
+    """
+
+    acceleration: Float[Array, "3"]
+    fluid_density: Scalar | None
+    frame: Frame = eqx.field(static=True, default="world", init=False)
+    effect = "gravity"
+
+    def __init__(self, acceleration: Any = (0.0, 0.0, -9.81), fluid_density: Any = None):
+        self.acceleration = numbers("Gravity.acceleration", acceleration, (3,))
+        self.fluid_density = (
+            None
+            if fluid_density is None
+            else numbers("Gravity.fluid_density", fluid_density, least=0.0)
+        )
+        self.frame = "world"
+
+    def density(self, rod: Rod, X: Scalar) -> Vector:
+        assert rod.material.density is not None  # a Scene sees to it
+        density = rod.material.density(X, rod.length)
+        if self.fluid_density is not None:
+            density = density - self.fluid_density
+        weight = density * rod.section.geometry(X, rod.length).area
+        zero = jnp.zeros_like(weight)
+        return (zero, zero, zero, *(weight * g for g in self.acceleration))
+
+
+class PointWrench(Load):
+    """A force and a moment on the section at one abscissa.
+
+    **Arguments:**
+    - `X`: where it acts [m], on the arm.
+    - `force` [N], `moment` [N m]: three numbers each.
+    - `frame`: `"world"` for a dead wrench, `"body"` for one that follows the section.
+    """
+
+    X: Scalar
+    force: Float[Array, "3"]
+    moment: Float[Array, "3"]
+    frame: Frame = eqx.field(static=True)
+    effect = "point wrench"
+
+    def __init__(
+        self,
+        X: Any,
+        force: Any = (0.0, 0.0, 0.0),
+        moment: Any = (0.0, 0.0, 0.0),
+        frame: Frame = "world",
+    ):
+        self.X = numbers("PointWrench.X", X, least=0.0)
+        self.force = numbers("PointWrench.force", force, (3,))
+        self.moment = numbers("PointWrench.moment", moment, (3,))
+        self.frame = choice("PointWrench.frame", frame, ("world", "body"))
+
+    def point(self, rod: Rod) -> tuple[Scalar, Vector]:
+        return self.X, (*split(self.moment), *split(self.force))
+
+    def breakpoints(self, rod: Rod) -> tuple[Scalar, ...]:
+        return (self.X,)
+
+
+class TipWrench(Load):
+    """A force and a moment on the arm's end; arguments as for `PointWrench`."""
+
+    force: Float[Array, "3"]
+    moment: Float[Array, "3"]
+    frame: Frame = eqx.field(static=True)
+    effect = "tip wrench"
+
+    def __init__(
+        self, force: Any = (0.0, 0.0, 0.0), moment: Any = (0.0, 0.0, 0.0), frame: Frame = "world"
+    ):
+        self.force = numbers("TipWrench.force", force, (3,))
+        self.moment = numbers("TipWrench.moment", moment, (3,))
+        self.frame = choice("TipWrench.frame", frame, ("world", "body"))
+
+    def point(self, rod: Rod) -> tuple[Scalar, Vector]:
+        return rod.length, (*split(self.moment), *split(self.force))
+
+
+class DistributedWrench(Load):
+    """A force and a moment per unit of reference length.
+
+    **Arguments:**
+    - `force` [N/m], `moment` [N m/m]: three profiles each (numbers, `Profile` or functions of X),
+      or one function of X that returns three numbers.
+    - `frame`: `"world"` for a dead load, `"body"` for one that follows the sections.
+    """
+
+    force: tuple[Profile, ...] | FunctionOfX
+    moment: tuple[Profile, ...] | FunctionOfX
+    frame: Frame = eqx.field(static=True)
+    effect = "distributed wrench"
+
+    def __init__(
+        self, force: Any = (0.0, 0.0, 0.0), moment: Any = (0.0, 0.0, 0.0), frame: Frame = "world"
+    ):
+        self.force = _three_profiles("DistributedWrench.force", force)
+        self.moment = _three_profiles("DistributedWrench.moment", moment)
+        self.frame = choice("DistributedWrench.frame", frame, ("world", "body"))
+
+    def density(self, rod: Rod, X: Scalar) -> Vector:
+        return (*_at(self.moment, rod, X), *_at(self.force, rod, X))
+
+    def breakpoints(self, rod: Rod) -> tuple[Scalar, ...]:
+        profiles = [
+            p
+            for vector in (self.force, self.moment)
+            if not isinstance(vector, FunctionOfX)
+            for p in vector
+        ]
+        return tuple(x for profile in profiles for x in profile.breakpoints)
+
+
+def _three_profiles(name: str, value: Any) -> tuple[Profile, ...] | FunctionOfX:
+    if isinstance(value, FunctionOfX):
+        return value
+    if callable(value):
+        return FunctionOfX(name, value)
+    if (
+        isinstance(value, str)
+        or not isinstance(value, Sequence | np.ndarray | Array)
+        or len(value) != 3
+    ):
+        raise ValueError(
+            f"{name}: got {value!r}, need three profiles, or a function of X that returns three "
+            f"numbers"
+        )
+    return tuple(as_profile(f"{name}[{i}]", x) for i, x in enumerate(value))
+
+
+def _at(vector: tuple[Profile, ...] | FunctionOfX, rod: Rod, X: Scalar) -> Vector:
+    if isinstance(vector, FunctionOfX):
+        return tuple(jnp.asarray(x, X.dtype) for x in vector(X))
+    return tuple(profile(X, rod.length) for profile in vector)

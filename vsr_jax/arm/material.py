@@ -1,0 +1,89 @@
+r"""Materials: with a section they make the stiffness $\Sigma = \mathrm{diag}(G J_x, E J_y, E J_z, E
+A, \kappa_y G A, \kappa_z G A)$."""
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from ..numerics.component import Vector
+from ..typing import Scalar
+from .profile import Limits, Profile, as_profile
+from .section import Section
+
+LEAST_POISSON, MOST_POISSON = -1.0, 0.5
+"""Poisson's ratio of a stable isotropic material is greater than the first and at most the
+second."""
+
+
+class Material(eqx.Module):
+    """Linear elastic material; its numbers may vary along the arm.
+
+    **Arguments**, each a profile (a number, a `Profile` or a function of X):
+    - `young`: Young's modulus $E$ [Pa].
+    - `shear` or `poisson`: the shear modulus $G$ [Pa], or Poisson's ratio $-1 < \\nu \\le 0.5$ [-]
+      for $G = E / (2 + 2\\nu)$; one of the two.
+    - `density`: $\\rho$ [kg/m^3], needed by `Gravity` only.
+    """
+
+    young: Profile
+    shear: Profile | None
+    poisson: Profile | None
+    density: Profile | None
+
+    def __init__(self, young: Any, shear: Any = None, poisson: Any = None, density: Any = None):
+        if (shear is None) == (poisson is None):
+            raise ValueError(
+                f"Material: got shear={shear!r} and poisson={poisson!r}, need one of the two"
+            )
+        self.young = as_profile("Material.young", young, positive=True)
+        self.shear = None if shear is None else as_profile("Material.shear", shear, positive=True)
+        self.poisson = (
+            None
+            if poisson is None
+            else as_profile("Material.poisson", poisson, above=LEAST_POISSON, most=MOST_POISSON)
+        )
+        self.density = (
+            None if density is None else as_profile("Material.density", density, positive=True)
+        )
+
+    def shear_modulus(self, X: Scalar, length: Scalar) -> Scalar:
+        """Shear modulus $G$ [Pa] at X [m]."""
+        if self.shear is not None:
+            return self.shear(X, length)
+        assert self.poisson is not None
+        return self.young(X, length) / (2 + 2 * self.poisson(X, length))
+
+    def limits(self, X: Scalar, length: Scalar) -> Limits:
+        """The numbers at X [m] and what they have to keep to."""
+        given = {
+            name: p
+            for name, p in (("young", self.young), ("shear", self.shear), ("density", self.density))
+            if p is not None
+        }
+        values = {name: profile(X, length) for name, profile in given.items()}
+        found = {(name, "a number > 0"): (value, value) for name, value in values.items()}
+        if self.poisson is not None:
+            ratio = self.poisson(X, length)
+            room = jnp.where(ratio <= MOST_POISSON, ratio - LEAST_POISSON, MOST_POISSON - ratio)
+            found["poisson", f"a ratio > {LEAST_POISSON:g} and <= {MOST_POISSON:g}"] = ratio, room
+        return found
+
+    def stiffness(self, section: Section, X: Scalar, length: Scalar) -> Vector:
+        """Diagonal of $\\Sigma(X)$, six scalars [N m^2] and [N]."""
+        shape, E, G = (
+            section.geometry(X, length),
+            self.young(X, length),
+            self.shear_modulus(X, length),
+        )
+        angular = (G * shape.torsion, E * shape.moment_y, E * shape.moment_z)
+        shear_y, shear_z = (kappa * G * shape.area for kappa in shape.shear_factors)
+        return (*angular, E * shape.area, shear_y, shear_z)
+
+    @property
+    def breakpoints(self) -> tuple[Scalar, ...]:
+        """Abscissas [m] where a number of the material or a derivative of it jumps."""
+        profiles = [
+            p for p in (self.young, self.shear, self.poisson, self.density) if p is not None
+        ]
+        return tuple(x for profile in profiles for x in profile.breakpoints)

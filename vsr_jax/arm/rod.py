@@ -1,0 +1,141 @@
+"""The rod: a slender arm with its section, material, rest strain and base."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..numerics.component import Vector, norm
+from ..typing import Pose, Scalar
+from ..validation import instance, numbers, rigid
+from .material import Material
+from .profile import FunctionOfX, Limits, Profile, as_profile
+from .section import Section
+
+STRAINS = ("torsion", "bending_y", "bending_z", "elongation", "shear_y", "shear_z")
+"""Names of the six strains $(k_x, k_y, k_z, u_x, u_y, u_z)$ in order."""
+
+_STRAIGHT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
+
+
+class Rod(eqx.Module):
+    """A Cosserat rod, clamped at its base.
+
+    **Arguments:**
+    - `length`: $L$ [m].
+    - `section`, `material`: what makes its stiffness, see `Material.stiffness`.
+    - `rest_strain`: $\\xi^*(X) = (k^*, u^*)$: six profiles (numbers, `Profile` or functions of X),
+      or one function of X that returns six numbers. The default (0, 0, 0, 1, 0, 0) is straight. The
+      elongation $u_x^*$ has to be positive.
+    - `base`: pose of the section at X = 0, a rigid transform of shape (4, 4); the identity by
+      default.
+    - `guide_radius`: threads are guided up to this radius [m] by discs wider than the section; by
+      default they run inside the section.
+    """
+
+    length: Scalar
+    section: Section
+    material: Material
+    rest_strain: tuple[Profile, ...] | FunctionOfX
+    base: Pose | None
+    guide_radius: Scalar | None
+
+    def __init__(
+        self,
+        length: Any,
+        section: Section,
+        material: Material,
+        *,
+        rest_strain: Sequence[Any] | Callable | None = None,
+        base: Any = None,
+        guide_radius: Any = None,
+    ):
+        self.length = numbers("Rod.length", length, positive=True)
+        self.section = instance(
+            "Rod.section",
+            section,
+            Section,
+            "a section such as Circular, Annular, Rectangular or Elliptic",
+        )
+        self.material = instance("Rod.material", material, Material, "a Material")
+        self.rest_strain = _rest_strain(rest_strain)
+        self.base = None if base is None else rigid("Rod.base", base)
+        self.guide_radius = (
+            None
+            if guide_radius is None
+            else numbers("Rod.guide_radius", guide_radius, positive=True)
+        )
+
+    def rest(self, X: Scalar) -> Vector:
+        """Rest strain $\\xi^*$ at X [m], six scalars."""
+        if isinstance(self.rest_strain, FunctionOfX):
+            return tuple(jnp.asarray(x, X.dtype) for x in self.rest_strain(X))
+        return tuple(profile(X, self.length) for profile in self.rest_strain)
+
+    def stiffness(self, X: Scalar) -> Vector:
+        """Diagonal of $\\Sigma$ at X [m], six scalars [N m^2] and [N]."""
+        return self.material.stiffness(self.section, X, self.length)
+
+    def limits(self, X: Scalar) -> Limits:
+        """Sizes, material and rest elongation at X [m] and what they have to keep to."""
+        parts = {
+            "section": self.section.limits(X, self.length),
+            "material": self.material.limits(X, self.length),
+        }
+        found = {
+            (f"{part}.{name}", needed): pair
+            for part, limits in parts.items()
+            for (name, needed), pair in limits.items()
+        }
+        elongation = self.rest(X)[3]
+        return {
+            **found,
+            ("rest_strain (elongation)", "a number > 0, which is 1 at the length of the rod,"): (
+                elongation,
+                elongation,
+            ),
+        }
+
+    def clearance(self, y: Scalar, z: Scalar, X: Scalar) -> Array:
+        """How far (y, z) lies inside what guides threads at X: positive inside [m]."""
+        inside = self.section.clearance(y, z, X, self.length)
+        return (
+            inside
+            if self.guide_radius is None
+            else jnp.maximum(inside, self.guide_radius - norm((y, z)))
+        )
+
+    @property
+    def breakpoints(self) -> tuple[Scalar, ...]:
+        """Abscissas [m] where a size, the material, the rest strain or a derivative of them
+        jumps."""
+        rest = () if isinstance(self.rest_strain, FunctionOfX) else self.rest_strain
+        return (
+            *self.section.breakpoints,
+            *self.material.breakpoints,
+            *(x for profile in rest for x in profile.breakpoints),
+        )
+
+
+def _rest_strain(value: Any) -> tuple[Profile, ...] | FunctionOfX:
+    if value is None:
+        value = _STRAIGHT
+    if isinstance(value, FunctionOfX):
+        return value
+    if callable(value):
+        return FunctionOfX("Rod.rest_strain", value)
+    if (
+        isinstance(value, str)
+        or not isinstance(value, Sequence | np.ndarray | Array)
+        or len(value) != 6
+    ):
+        raise ValueError(
+            f"Rod.rest_strain: got {value!r}, need six profiles in the order "
+            f"{', '.join(STRAINS)}, or a function of X"
+        )
+    return tuple(
+        as_profile(f"Rod.rest_strain ({name})", x) for name, x in zip(STRAINS, value, strict=True)
+    )

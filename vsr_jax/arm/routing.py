@@ -1,0 +1,194 @@
+"""Thread paths: where a thread crosses the sections, $d(X) = (0, d_y, d_z)$, in the section's
+frame.
+
+A routing is called as `routing(X)` with a scalar X [m] and returns (d_y, d_z) [m]; its derivatives
+are taken by forward differentiation, so a path is written down once.
+"""
+
+import math
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ..numerics.component import Vector
+from ..typing import Scalar
+from ..validation import choice, numbers
+from .profile import FunctionOfX, PolynomialProfile, SplineProfile
+
+
+class Path(NamedTuple):
+    """One thread where it crosses the sections: position (d_y, d_z) [m] and slope (d_y', d_z')
+    [-]."""
+
+    y: Array
+    z: Array
+    slope_y: Array
+    slope_z: Array
+
+
+def thread_tangent(xi: Vector, path: Path) -> Vector:
+    """Tangent of a thread's path in the section's frame (eq. 11): $t_c = k \\times d + u + d'$."""
+    kx, ky, kz, ux, uy, uz = xi
+    return (
+        ux + ky * path.z - kz * path.y,
+        uy + path.slope_y - kx * path.z,
+        uz + path.slope_z + kx * path.y,
+    )
+
+
+class Routing(eqx.Module):
+    """The path of one thread through the sections."""
+
+    @abstractmethod
+    def __call__(self, X: Scalar) -> tuple[Scalar, Scalar]:
+        """Position $(d_y, d_z)$ [m] at X [m]."""
+
+    @property
+    def breakpoints(self) -> tuple[Scalar, ...]:
+        """Abscissas [m] where a derivative of the path jumps."""
+        return ()
+
+    def path(self, X: Scalar) -> Path:
+        """Position and slope at X [m]."""
+        (y, z), (slope_y, slope_z) = jax.jvp(self, (X,), (jnp.ones_like(X),))
+        return Path(y, z, slope_y, slope_z)
+
+
+class Parallel(Routing):
+    """Parallel to the axis: $d = (0, y, z)$, in metres."""
+
+    y: Scalar
+    z: Scalar
+
+    def __init__(self, y: Any, z: Any):
+        self.y = numbers("Parallel.y", y)
+        self.z = numbers("Parallel.z", z)
+
+    def __call__(self, X: Scalar) -> tuple[Scalar, Scalar]:
+        return self.y, self.z
+
+
+class Linear(Routing):
+    """Straight and oblique (eq. 22): $d = (0, y + \\bar y X, z + \\bar z X)$, slopes $\\bar y,
+    \\bar z$ without unit."""
+
+    y: Scalar
+    z: Scalar
+    slope_y: Scalar
+    slope_z: Scalar
+
+    def __init__(self, y: Any, z: Any, slope_y: Any = 0.0, slope_z: Any = 0.0):
+        self.y = numbers("Linear.y", y)
+        self.z = numbers("Linear.z", z)
+        self.slope_y = numbers("Linear.slope_y", slope_y)
+        self.slope_z = numbers("Linear.slope_z", slope_z)
+
+    def __call__(self, X: Scalar) -> tuple[Scalar, Scalar]:
+        return self.y + self.slope_y * X, self.z + self.slope_z * X
+
+
+class Helix(Routing):
+    """Helix (eq. 23): $d = (0, r \\cos\\phi, r \\sin\\phi)$, $\\phi = \\phi_0 \\pm 2 \\pi X / p$,
+    $p = 2 \\pi r \\tan\\alpha$.
+
+    **Arguments:**
+    - `radius`: $r$ [m], positive.
+    - `angle` or `pitch`: the angle $\\alpha$ between path and cross-section [rad], at most $\\pi /
+      2$, or the pitch $p$ [m]; one of the two. With `angle` the pitch follows the radius.
+    - `phase`: $\\phi_0$ [rad].
+    - `hand`: `"right"` winds from y towards z along the arm, `"left"` the other way.
+    """
+
+    radius: Scalar
+    angle: Scalar | None
+    pitch: Scalar | None
+    phase: Scalar
+    hand: Literal["right", "left"] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        radius: Any,
+        angle: Any = None,
+        *,
+        pitch: Any = None,
+        phase: Any = 0.0,
+        hand: Literal["right", "left"] = "right",
+    ):
+        if (angle is None) == (pitch is None):
+            raise ValueError(f"Helix: got angle={angle!r} and pitch={pitch!r}, need one of the two")
+        self.radius = numbers("Helix.radius", radius, positive=True)
+        self.angle = (
+            None if angle is None else numbers("Helix.angle", angle, positive=True, most=1.5708)
+        )
+        self.pitch = None if pitch is None else numbers("Helix.pitch", pitch, positive=True)
+        self.phase = numbers("Helix.phase", phase)
+        self.hand = choice("Helix.hand", hand, ("right", "left"))
+
+    @property
+    def wavenumber(self) -> Scalar:
+        """$\\omega = 2 \\pi / p$ [rad/m], the rate at which the path turns about the axis."""
+        if self.pitch is not None:
+            return 2 * math.pi / self.pitch
+        assert self.angle is not None
+        return 1 / (self.radius * jnp.tan(self.angle))
+
+    def __call__(self, X: Scalar) -> tuple[Scalar, Scalar]:
+        phi = self.phase + (1 if self.hand == "right" else -1) * self.wavenumber * X
+        return self.radius * jnp.cos(phi), self.radius * jnp.sin(phi)
+
+
+class Polynomial(Routing):
+    """Polynomial path: $d_y = \\sum_i y_i X^i$, $d_z = \\sum_i z_i X^i$, coefficients in rising
+    order [m^(1-i)]."""
+
+    y: PolynomialProfile
+    z: PolynomialProfile
+
+    def __init__(self, y: Any, z: Any):
+        self.y = PolynomialProfile(numbers("Polynomial.y", y, None))
+        self.z = PolynomialProfile(numbers("Polynomial.z", z, None))
+
+    def __call__(self, X: Scalar) -> tuple[Scalar, Scalar]:
+        return self.y(X, X), self.z(X, X)
+
+
+class Spline(Routing):
+    """Cubic not-a-knot spline through the points (X, y, z), in metres, at least two."""
+
+    y: SplineProfile
+    z: SplineProfile
+
+    def __init__(self, X: Any, y: Any, z: Any):
+        knots = numbers("Spline.X", X, None)
+        self.y = SplineProfile(knots, numbers("Spline.y", y, knots.shape))
+        self.z = SplineProfile(knots, numbers("Spline.z", z, knots.shape))
+
+    def __call__(self, X: Scalar) -> tuple[Scalar, Scalar]:
+        return self.y(X, X), self.z(X, X)
+
+    @property
+    def breakpoints(self) -> tuple[Scalar, ...]:
+        return self.y.breakpoints
+
+
+class Function(Routing):
+    """Any path: (d_y, d_z) = `function(X, *parameters)`, written with `jax.numpy`.
+
+    **Arguments:**
+    - `function`: takes the scalar X [m] and the parameters, returns the pair (d_y, d_z) [m].
+    - `parameters`: as for `FunctionOfX`.
+    """
+
+    function: FunctionOfX
+
+    def __init__(self, function: Callable, *parameters: Any):
+        self.function = FunctionOfX("Function", function, *parameters)
+
+    def __call__(self, X: Scalar) -> tuple[Scalar, Scalar]:
+        y, z = self.function(X)
+        return jnp.asarray(y, X.dtype), jnp.asarray(z, X.dtype)

@@ -1,0 +1,322 @@
+"""A scene: a rod with its actuators and loads, and what they present to the models at each
+cross-section."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ..numerics.component import Vector, add, dot
+from ..numerics.quadrature import make_grid, piece_edges
+from ..typing import Scalar, cast
+from ..validation import ROUNDING, concrete, instance, is_traced, numbers, precise
+from .actuator import Actuator, Tendon
+from .loads import Frame, Gravity, Load
+from .profile import Limits
+from .rod import STRAINS, Rod
+from .routing import Path, thread_tangent
+
+
+class CrossSections(NamedTuple):
+    r"""What a balance knows of the cross-sections at some X: the diagonal of $\Sigma$ (6), $\xi^*$
+    (6), each thread's `Path`, and whether the thread reaches there: 1 or 0, None for one that runs
+    along the whole arm."""
+
+    stiffness: Vector
+    rest: Vector
+    paths: tuple[Path, ...]
+    reach: tuple[Array | None, ...]
+
+    def carry(self, forces: Vector) -> Vector:
+        """Force of each thread here: that of its start where it reaches, none elsewhere."""
+        return shared(forces, self.reach)
+
+
+def shared(forces: Vector, shares: tuple[Array | None, ...]) -> Vector:
+    """Forces of threads, each times its share; None stands for all of it."""
+    return tuple(f if share is None else f * share for f, share in zip(forces, shares, strict=True))
+
+
+class Scene(eqx.Module):
+    """A rod, the actuators laid through it and the loads on it. Only what is present is computed.
+
+    **Arguments:**
+    - `rod`: the arm.
+    - `actuators`: `Thread`, `Tendon` and `Chamber` in the order of the inputs.
+    - `loads`: `Gravity`, `TipWrench`, `PointWrench` and `DistributedWrench`.
+    - `free_strains`: names of the strains that can change, all six by default; the others keep
+      their rest value and the solve has the size of those that are left. `("bending_y",
+      "bending_z")` is an inextensible rod without twist and shear.
+
+    **Raises:** `ValueError` if a thread leaves the section (or the rod's `guide_radius`), a size, a
+    modulus, a density or the rest elongation is not positive somewhere, a tube has no wall or
+    Poisson's ratio is out of its range, a thread ends or a load acts beyond the arm, or gravity
+    meets a material without density; numbers are looked at only while they are known, not under
+    `jax.jit`.
+    """
+
+    rod: Rod
+    actuators: tuple[Actuator, ...]
+    loads: tuple[Load, ...]
+    free_strains: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        rod: Rod,
+        actuators: Sequence[Actuator] = (),
+        loads: Sequence[Load] = (),
+        *,
+        free_strains: Sequence[str] = STRAINS,
+    ):
+        self.rod = instance("Scene.rod", rod, Rod, "a Rod")
+        self.actuators = _each(
+            "Scene.actuators", actuators, Actuator, "a Thread, Tendon or Chamber"
+        )
+        self.loads = _each(
+            "Scene.loads", loads, Load, "a Gravity, TipWrench, PointWrench or DistributedWrench"
+        )
+        names = (free_strains,) if isinstance(free_strains, str) else tuple(free_strains)
+        if not names or any(name not in STRAINS for name in names):
+            raise ValueError(
+                f"Scene.free_strains: got {free_strains!r}, need some of {', '.join(STRAINS)}"
+            )
+        self.free_strains = tuple(name for name in STRAINS if name in names)
+        if any(isinstance(load, Gravity) for load in self.loads) and rod.material.density is None:
+            raise ValueError(
+                "Scene.loads: got a Gravity and a rod whose material has no density, need "
+                "Material(..., density=...)"
+            )
+        self._check_numbers()
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """What the scene calls for beyond a bare rod, in words; each costs something only when it
+        is named here."""
+        names = [actuator.effect for actuator in self.actuators]
+        names += [
+            f"follower {load.effect}" if load.frame == "body" else load.effect
+            for load in self.loads
+        ]
+        if any(isinstance(load, Gravity) and load.fluid_density is not None for load in self.loads):
+            names.append("buoyancy")
+        if self.breakpoints:
+            names.append("sections")
+        tendons = [actuator for actuator in self.actuators if isinstance(actuator, Tendon)]
+        names += ["length control"] * any(tendon.control == "length" for tendon in tendons)
+        names += ["elastic tendons"] * any(tendon.stiffness is not None for tendon in tendons)
+        names += ["friction"] * any(tendon.friction is not None for tendon in tendons)
+        if len(self.free_strains) < len(STRAINS):
+            names.append("only " + ", ".join(self.free_strains))
+        return tuple(dict.fromkeys(names))
+
+    @property
+    def free(self) -> tuple[int, ...]:
+        """Places of the free strains among the six."""
+        return tuple(STRAINS.index(name) for name in self.free_strains)
+
+    @property
+    def length_driven(self) -> tuple[int, ...]:
+        """Which actuators are driven by their length."""
+        return tuple(
+            i
+            for i, a in enumerate(self.actuators)
+            if isinstance(a, Tendon) and a.control == "length"
+        )
+
+    @property
+    def frictional(self) -> tuple[int, ...]:
+        """Which actuators have friction."""
+        return tuple(
+            i
+            for i, a in enumerate(self.actuators)
+            if isinstance(a, Tendon) and a.friction is not None
+        )
+
+    @property
+    def coupled(self) -> bool:
+        """Whether the cross-sections depend on each other: through loads, a given thread length or
+        friction."""
+        return bool(self.loads or self.length_driven or self.frictional)
+
+    @property
+    def breakpoints(self) -> tuple[Scalar, ...]:
+        """Abscissas [m] where the strain or a derivative of it jumps."""
+        laid = [x for actuator in self.actuators for x in actuator.breakpoints]
+        return (
+            *self.rod.breakpoints,
+            *laid,
+            *(x for load in self.loads for x in load.breakpoints(self.rod)),
+        )
+
+    def edges(self, more: tuple[Scalar, ...] = ()) -> Float[Array, " edges"]:
+        """Ends of the smooth pieces of the arm [m], `more` breakpoints included."""
+        return piece_edges(self.rod.length, (*self.breakpoints, *more))
+
+    def sections(self, X: Array) -> CrossSections:
+        """Stiffness, rest strain and thread paths at abscissas X of any shape, in component arrays
+        of that shape."""
+
+        def at(x: Scalar) -> CrossSections:
+            paths = tuple(actuator.routing.path(x) for actuator in self.actuators)
+            reach = tuple(actuator.reach(x) for actuator in self.actuators)
+            return CrossSections(self.rod.stiffness(x), self.rod.rest(x), paths, reach)
+
+        if X.ndim == 0:
+            return at(X)
+        nodes = jax.vmap(at)(X.reshape(-1))
+        return jax.tree.map(lambda leaf: leaf.reshape(X.shape), nodes)
+
+    def forces(self, inputs: Float[Array, " inputs"]) -> Vector:
+        r"""Signed thread forces $\tau$ [N] for the inputs, one scalar a thread."""
+        return tuple(
+            actuator.force(value) for actuator, value in zip(self.actuators, inputs, strict=True)
+        )
+
+    def density(self, X: Array, frame: Frame) -> Vector | None:
+        """Load per length $(c, f)$ of all loads of a frame at abscissas X of any shape; None if the
+        scene has none."""
+        total = None
+        for load in self.loads:
+            if load.frame != frame or load.point(self.rod) is not None:
+                continue
+            here = jax.vmap(lambda x, load=load: load.density(self.rod, x) or ())(X.reshape(-1))
+            here = tuple(jnp.broadcast_to(x, X.size).reshape(X.shape) for x in here)
+            total = here if total is None else add(total, here)
+        return total
+
+    def point_wrenches(self, frame: Frame) -> tuple[tuple[Scalar, Vector], ...]:
+        """Abscissa and wrench $(M, F)$ of each load of a frame that acts at a point."""
+        points = [load.point(self.rod) for load in self.loads if load.frame == frame]
+        return tuple(point for point in points if point is not None)
+
+    def admits(self, inputs: Float[Array, " inputs"]) -> Bool[Array, ""]:
+        """Whether every input is finite and in its actuator's range."""
+        checks = [
+            actuator.admits(value) for actuator, value in zip(self.actuators, inputs, strict=True)
+        ]
+        return jnp.all(jnp.stack(checks)) if checks else jnp.array(True)
+
+    def check_inputs(self, inputs: Any) -> Float[Array, " inputs"]:
+        """`inputs` as an array, one number an actuator.
+
+        **Raises:** `ValueError` for a wrong number of inputs and, while their values are known, for
+        NaN, infinities and values outside an actuator's range.
+        """
+        array = numbers("inputs", inputs, None, finite=False)
+        kinds = ", ".join(type(a).__name__ for a in self.actuators)
+        if array.shape != (len(self.actuators),):
+            raise ValueError(
+                f"inputs: got shape {array.shape}, need ({len(self.actuators)},), one number each "
+                f"for {kinds}; for a batch use jax.vmap"
+            )
+        known = concrete(array)
+        if known is None:
+            return array
+        for i, (actuator, value) in enumerate(zip(self.actuators, known, strict=True)):
+            if not (np.isfinite(value) and value >= actuator.lowest):
+                needed = (
+                    "a finite number"
+                    if np.isinf(actuator.lowest)
+                    else f"a finite number >= {actuator.lowest:g}"
+                )
+                raise ValueError(
+                    f"inputs[{i}]: got {value:g}, need {needed} [{actuator.unit}] for a "
+                    f"{type(actuator).__name__}"
+                )
+        for i in self.length_driven:
+            length = concrete(self.rest_length(i))
+            if length is not None and not known[i] > -length:
+                raise ValueError(
+                    f"inputs[{i}]: got {known[i]:g}, need a change of length > {-length:g} m, all "
+                    f"that the tendon has"
+                )
+        return array
+
+    def rest_length(self, place: int) -> Scalar:
+        """Length of a thread's path in the arm at rest [m]."""
+        return _rest_length(self, place)
+
+    def astype(self, dtype: Any) -> "Scene":
+        """The same scene with its floating-point numbers in `dtype`, float32 or float64."""
+        precise("dtype", jnp.zeros((), dtype))
+        return cast(self, dtype)
+
+    def _check_numbers(self) -> None:
+        if any(is_traced(leaf) for leaf in jax.tree.leaves((self.rod, self.actuators, self.loads))):
+            return
+        length = float(self.rod.length)
+        self._check_places(length)
+        probe = jax.tree.map(concrete, _probe(self))
+        if probe[0] is None:
+            return
+        X, limited, clearances = probe
+        for (name, needed), (values, room) in limited.items():
+            if not np.all(room > 0):
+                i, unit = int(np.argmin(room)), " m" if name.startswith("section") else ""
+                raise ValueError(
+                    f"Scene.rod.{name}: got {values[i]:g}{unit} at X = {X[i]:g} m, need {needed} "
+                    f"everywhere"
+                )
+        for i, values in enumerate(clearances):
+            j = int(np.argmin(values))
+            if not values[j] > -ROUNDING * length:
+                raise ValueError(
+                    f"Scene.actuators[{i}].routing: the thread lies {-values[j]:.3g} m outside "
+                    f"the section at X = {X[j]:g} m; "
+                    "need a path inside the section (or give the rod a guide_radius)"
+                )
+
+    def _check_places(self, length: float) -> None:
+        """Thread ends and point loads lie on the arm."""
+        beyond = length * (1 + ROUNDING)
+        for i, actuator in enumerate(self.actuators):
+            for name, x in (("start", actuator.start), ("end", actuator.end)):
+                if x is not None and (
+                    float(x) > beyond or (name == "start" and float(x) >= length)
+                ):
+                    raise ValueError(
+                        f"Scene.actuators[{i}].{name}: got {float(x):g} m, need a place on the "
+                        f"arm of {length:g} m"
+                    )
+        for i, load in enumerate(self.loads):
+            point = load.point(self.rod)
+            if point is not None and float(point[0]) > beyond:
+                raise ValueError(
+                    f"Scene.loads[{i}].X: got {float(point[0]):g} m, need a place on the arm of "
+                    f"{length:g} m"
+                )
+
+
+def _each(name: str, values: Any, kind: type, needed: str) -> tuple:
+    values = (values,) if isinstance(values, kind) else values
+    return tuple(instance(f"{name}[{i}]", value, kind, needed) for i, value in enumerate(values))
+
+
+@eqx.filter_jit
+def _rest_length(scene: Scene, place: int) -> Scalar:
+    grid = make_grid(scene.edges(), 32, 3)
+    sections = scene.sections(grid.X)
+    t_c, reach = thread_tangent(sections.rest, sections.paths[place]), sections.reach[place]
+    return jnp.sum(grid.weight * jnp.sqrt(dot(t_c, t_c)) * (1.0 if reach is None else reach))
+
+
+@eqx.filter_jit
+def _probe(scene: Scene) -> tuple[Array, Limits, list[Array]]:
+    """Places X [m] along the arm; there, the rod's numbers that have limits, and how far each
+    thread lies inside the section [m]."""
+    rod = scene.rod
+    X = jnp.linspace(0, 1, 65) * rod.length
+
+    def clearance(actuator: Actuator, x: Scalar) -> Array:
+        inside, reach = rod.clearance(*actuator.routing(x), x), actuator.reach(x)
+        return inside if reach is None else jnp.where(reach > 0, inside, jnp.inf)
+
+    return (
+        X,
+        jax.vmap(rod.limits)(X),
+        [jax.vmap(lambda x, a=a: clearance(a, x))(X) for a in scene.actuators],
+    )

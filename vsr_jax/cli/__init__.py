@@ -1,0 +1,1 @@
+"""The command line: `vsr-jax`, one module for each group of commands."""

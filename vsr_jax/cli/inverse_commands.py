@@ -1,0 +1,85 @@
+"""The command `reach`: the inputs that bring a scene's tip to a place."""
+
+import argparse
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..analysis.plausible import strain_warnings
+from . import report
+from .common import DONE, NOT_CONVERGED, add_bounds, bounds, check_folders, command, hasten, warn
+from .scene_commands import add_scene, model_between, save, task_of
+
+
+def add_reach(commands: Any) -> None:
+    """Adds the command `reach`."""
+    parser = command(
+        commands,
+        "reach",
+        help="find the inputs of a scene file that bring its tip to a place",
+        description="Finds inputs between two bounds that bring the tip to a place with the least "
+        "effort, and solves the scene there.\n"
+        "Ends with 1 where the place is out of reach; what is printed then is the nearest.",
+        example="vsr-jax reach scene.toml --target 0.5 0.1 0.2 --high 12",
+        run=_reach,
+    )
+    add_scene(parser)
+    parser.add_argument(
+        "--target",
+        metavar=("X", "Y", "Z"),
+        nargs=3,
+        type=float,
+        required=True,
+        help="place of the tip [m]",
+    )
+    add_bounds(parser, "twice --inputs, or those of the file")
+    parser.add_argument(
+        "--allowed-miss",
+        metavar="M",
+        type=float,
+        help="distance [m] from the target that counts as reached (default: 1e-4 of the length)",
+    )
+    parser.add_argument(
+        "--json", metavar="FILE", help="save target, inputs, miss and the pose of the tip"
+    )
+
+
+def _reach(options: argparse.Namespace) -> int:
+    from ..analysis.inverse import reach
+
+    hasten(optimise=True)
+    task = task_of(options)
+    check_folders(options.json)
+    low, high = bounds(options.low, options.high, 2 * np.asarray(task.inputs))
+    model = model_between(task, options.tolerance, low, high)
+    found = reach(
+        task.scene,
+        jnp.asarray(options.target, task.inputs.dtype),
+        (low, high),
+        model=model,
+        allowed_miss=options.allowed_miss,
+    )
+    print("\n".join(report.lines(found.equilibrium, task.title or options.scene)))
+    print(f"  inputs     {', '.join(f'{value:.6g}' for value in np.asarray(found.inputs))}")
+    verdict = (
+        "within the"
+        if bool(found.reached)
+        else "out of reach, this is the nearest found: more than the"
+    )
+    print(
+        f"  miss       {float(found.miss):.2g} m, {verdict} {float(found.allowed_miss):.2g} m "
+        f"allowed"
+    )
+    warn(strain_warnings(found.equilibrium))
+    if options.json:
+        outcome = {
+            "target": options.target,
+            "inputs": np.asarray(found.inputs).tolist(),
+            "miss": float(found.miss),
+            "allowed_miss": float(found.allowed_miss),
+            "reached": bool(found.reached),
+            "tip": np.asarray(found.equilibrium.tip).tolist(),
+        }
+        save(options.json, {"scene": options.scene, "title": task.title, **outcome})
+    return DONE if bool(found.reached) else NOT_CONVERGED

@@ -1,0 +1,243 @@
+"""The commands that take a scene file: `solve` solves it, `check` says how healthy the solve is."""
+
+import argparse
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..analysis.health import check
+from ..analysis.plausible import strain_warnings, warnings_of
+from ..arm.scene import Scene
+from ..files.scene_file import load
+from ..models.base import Model
+from ..models.basis import Basis, Legendre
+from ..models.prescribed import Prescribed
+from ..models.strain_dependent import StrainDependent
+from ..solution.equilibrium import Equilibrium
+from ..solution.solver import solve
+from ..solution.step_choice import plan
+from .common import (
+    DONE,
+    NOT_CONVERGED,
+    add_precision,
+    check_folders,
+    command,
+    hasten,
+    positive,
+    use,
+    warn,
+)
+
+MODELS = ("strain-dependent", "prescribed", "continuum")
+"""Names of the models in the order of how often they are wanted."""
+
+LEGENDRE_ORDER = 8
+"""Order of the Legendre polynomials that `--model prescribed` takes for each free strain."""
+
+STATIONS = 41
+"""How many stations, evenly spaced from base to tip, go into a picture and a JSON file."""
+
+_SCENE_EXAMPLE = """
+a scene file:
+  inputs = [10.0, 5.0]                # tensions [N]; --inputs goes first
+  [rod]
+  length = 0.75                       # SI units throughout
+  section = { type = "Circular", radius = { type = "Taper", base = 0.012, tip = 0.010 } }
+  material = { young = 5.93e5, shear = 2.00e5 }
+  [[actuators]]
+  type = "Tendon"
+  routing = { type = "Helix", radius = 0.005, angle = 1.529 }
+  [[actuators]]
+  type = "Tendon"
+  routing = { type = "Parallel", y = 0.0, z = 0.005 }
+"""
+
+
+def add_solve(commands: Any) -> None:
+    """Adds the command `solve`."""
+    parser = command(
+        commands,
+        "solve",
+        help="solve a scene file and print, draw or save the result",
+        description="Solves the scene of a TOML file and prints status, tip, stability and "
+        "threads.",
+        example="vsr-jax solve scene.toml --inputs 8 2.5 --plot arm.png --json arm.json",
+        more=_SCENE_EXAMPLE,
+        run=_solve,
+    )
+    add_scene(parser)
+    parser.add_argument(
+        "--plot", metavar="FILE", help="draw the arm into a picture: .png, .pdf, .svg"
+    )
+    parser.add_argument(
+        "--json",
+        metavar="FILE",
+        help="save inputs, status, tip, positions, strains, threads and stability",
+    )
+
+
+def add_check(commands: Any) -> None:
+    """Adds the command `check`."""
+    parser = command(
+        commands,
+        "check",
+        help="say how healthy the solve of a scene file is",
+        description="Solves the scene of a TOML file, and some seventy others around it. Prints "
+        "the status, the margin of stability,\n"
+        "how far inputs and loads may grow and what ends it, by how much finer steps move the "
+        "tip, and the conditioning,\n"
+        "with advice.",
+        example="vsr-jax check scene.toml --inputs 8 2.5",
+        run=_check,
+    )
+    add_scene(parser)
+    parser.add_argument("--json", metavar="FILE", help="save the report")
+
+
+def add_scene(parser: argparse.ArgumentParser) -> None:
+    """The arguments that say what is solved, and how."""
+    parser.add_argument("scene", metavar="SCENE", help="the TOML file")
+    parser.add_argument(
+        "--inputs",
+        "--input",
+        metavar="U",
+        nargs="*",
+        type=float,
+        help="one number an actuator (default: those of the file)",
+    )
+    parser.add_argument(
+        "--model",
+        choices=MODELS,
+        help=f"how to solve (default: vsr.solve chooses); prescribed: Legendre polynomials to "
+        f"order {LEGENDRE_ORDER} for each free strain",
+    )
+    parser.add_argument(
+        "--steps", metavar="N", type=positive, help="steps along the arm (default: the model's)"
+    )
+    parser.add_argument(
+        "--tolerance",
+        metavar="M",
+        type=float,
+        help="as many steps as bring the tip within M metres, instead of --steps",
+    )
+    add_precision(parser)
+
+
+class Task(NamedTuple):
+    """What the command line and the file ask for."""
+
+    scene: Scene
+    inputs: Array
+    model: Model | None
+    title: str
+
+
+def task_of(options: argparse.Namespace) -> Task:
+    """What is to be solved, in the precision asked for; warns of implausible numbers.
+
+    **Raises:** `ValueError` for a file or numbers that make no sense.
+    """
+    use(options.precision)
+    scene, inputs, title = load(options.scene)
+    warn(warnings_of(scene))
+    inputs = inputs if options.inputs is None else options.inputs
+    if inputs is None and scene.actuators:
+        kinds = ", ".join(type(actuator).__name__ for actuator in scene.actuators)
+        raise ValueError(
+            f"{options.scene}: holds no inputs, need --inputs, one number each for {kinds}"
+        )
+    values = jnp.asarray([] if inputs is None else inputs, options.precision)
+    if options.tolerance is not None and (options.model, options.steps) != (None, None):
+        raise ValueError(
+            "--tolerance: got --model or --steps too, need one or the other: a tolerance chooses "
+            "both"
+        )
+    return Task(scene, values, _model(options.model, options.steps, scene), title)
+
+
+def model_between(
+    task: Task, tolerance: float | None, low: np.ndarray, high: np.ndarray
+) -> Model | None:
+    """The model asked for, or for inputs between two bounds the one that a tolerance takes."""
+    if tolerance is None:
+        return task.model
+    dtype = task.inputs.dtype
+    return plan(task.scene, tolerance, (low.astype(dtype), high.astype(dtype))).model
+
+
+def _solve(options: argparse.Namespace) -> int:
+    hasten(optimise=False)
+    scene, inputs, model, title = task_of(options)
+    check_folders(options.plot, options.json)
+    eq = solve(scene, inputs, model=model, tolerance=options.tolerance)
+    _tell(eq, title, options)
+    warn(strain_warnings(eq))
+    return DONE if bool(eq.converged) else NOT_CONVERGED
+
+
+def _check(options: argparse.Namespace) -> int:
+    from . import report
+
+    hasten(optimise=True)
+    scene, inputs, model, title = task_of(options)
+    check_folders(options.json)
+    model = (
+        model
+        if options.tolerance is None
+        else solve(scene, inputs, tolerance=options.tolerance).model
+    )
+    health = check(scene, inputs, model=model)
+    print("\n".join(report.health_lines(health, title or options.scene)))
+    warn(strain_warnings(health.equilibrium))
+    if options.json:
+        save(options.json, {"scene": options.scene, "title": title, **report.health_record(health)})
+    return DONE if bool(health.equilibrium.converged) else NOT_CONVERGED
+
+
+def _tell(eq: Equilibrium, title: str, options: argparse.Namespace) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from ..viz import plot
+    from . import report
+
+    print("\n".join(report.lines(eq, title or options.scene, error=options.tolerance is not None)))
+    samples = None
+    if bool(eq.converged) and (options.plot or options.json):
+        samples = plot.sample(eq, np.linspace(0.0, float(eq.scene.rod.length), STATIONS))
+    if options.json:
+        save(options.json, {"scene": options.scene, "title": title, **report.record(eq, samples)})
+    if options.plot and samples is not None:
+        ax = plot.arm(samples)
+        ax.set_title(title)
+        ax.figure.savefig(options.plot, dpi=200, bbox_inches="tight")
+    elif options.plot:
+        print(f"vsr-jax: {options.plot} is not drawn, there is no shape", file=sys.stderr)
+
+
+def save(path: str, content: Any) -> None:
+    """Writes a JSON file."""
+    Path(path).write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _model(name: str | None, steps: int | None, scene: Scene) -> Model | None:
+    if name is None and steps is None:
+        return None
+    if name == "continuum":
+        from ..models.continuum import Continuum
+
+        if steps is not None:
+            raise ValueError("--steps: the continuum model chooses its steps by itself")
+        return Continuum()
+    chosen = (
+        Prescribed(Basis.uniform(Legendre(LEGENDRE_ORDER), scene.free_strains))
+        if name == "prescribed"
+        else StrainDependent()
+    )
+    return chosen if steps is None else replace(chosen, steps=steps)

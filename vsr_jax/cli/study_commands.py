@@ -1,0 +1,183 @@
+"""The commands that study: `paper` runs section IV of the paper anew, `effects` shows what each
+effect of a scene costs, `accuracy` what each digit costs."""
+
+import argparse
+import sys
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..models.strain_dependent import StrainDependent
+from .common import DONE, NOT_CONVERGED, check_folders, command, positive
+from .scene_commands import Task, save, task_of
+
+_GROUPS = ("steps", "bases", "continuum")
+"""Those of `accuracy`, which takes a second to import."""
+
+
+def add_paper(commands: Any) -> None:
+    """Adds the command `paper`."""
+    parser = command(
+        commands,
+        "paper",
+        help="run section IV of the paper anew: table and figures",
+        description="Solves the cases of section IV of Renda et al. (2020) with every model, "
+        "compares them with the reference\n"
+        "solutions and writes table.md, table.json, Fig. 2 and, with case A2, Fig. 3 (PNG and "
+        "PDF). All cases take about\n"
+        "two minutes on two cores.",
+        example="vsr-jax paper --out results --cases A2 B1",
+        run=_paper,
+    )
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        default="paper",
+        help="folder for the results, made if need be (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--cases", metavar="CASE", nargs="+", help="cases among A1 A2 A3 B1 B2 C1 C2 (default: all)"
+    )
+
+
+def add_effects(commands: Any) -> None:
+    """Adds the command `effects`."""
+    parser = command(
+        commands,
+        "effects",
+        help="what each effect of a scene costs on this machine",
+        description="Adds the effects to one arm, one after another: poses, gravity, a tip "
+        "wrench, a follower load, a second section,\n"
+        "a tendon driven by its length, friction. Prints operations of the compiled program (the "
+        "body of each loop counted\n"
+        "once), compile time and the times of a solve, alone and in a batch, each against the row "
+        "above. Takes a few minutes.",
+        example="vsr-jax effects --batch-size 64 --json effects.json",
+        run=_effects,
+    )
+    parser.add_argument(
+        "--batch-size",
+        type=positive,
+        default=256,
+        help="shapes in the batch (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--steps", type=positive, default=16, help="steps along the arm (default: %(default)s)"
+    )
+    parser.add_argument("--json", metavar="FILE", help="save the figures")
+
+
+def add_accuracy(commands: Any) -> None:
+    """Adds the command `accuracy`."""
+    parser = command(
+        commands,
+        "accuracy",
+        help="show what accuracy costs on a scene, by every model",
+        description="Solves a scene, the paper's B2 by default, by every model at several "
+        "resolutions, for inputs drawn between a tenth\n"
+        "and the whole of those given. Prints errors of tip, strain and gradient and the times "
+        "they take, and says what to use for\n"
+        "a millimetre, a micrometre and a nanometre. Compiles some thirty programs three times: "
+        "five minutes, more with loads.",
+        example="vsr-jax accuracy scene.toml --groups steps --plot accuracy.png --json "
+        "accuracy.json",
+        run=_accuracy,
+    )
+    parser.add_argument(
+        "scene", metavar="SCENE", nargs="?", help="the TOML file (default: the paper's B2)"
+    )
+    parser.add_argument(
+        "--inputs",
+        metavar="U",
+        nargs="+",
+        type=float,
+        help="one number an actuator (default: those of the file)",
+    )
+    parser.add_argument(
+        "--groups", nargs="+", choices=_GROUPS, default=list(_GROUPS), help="models (default: all)"
+    )
+    parser.set_defaults(model=None, steps=None, precision="float64")
+    parser.add_argument(
+        "--batch-size",
+        type=positive,
+        default=128,
+        help="shapes in the batch (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--plot", metavar="FILE", help="draw tip errors over times: .png, .pdf, .svg"
+    )
+    parser.add_argument("--json", metavar="FILE", help="save the figures")
+
+
+def _paper(options: argparse.Namespace) -> int:
+    import matplotlib
+
+    jax.config.update("jax_enable_x64", True)
+    matplotlib.use("Agg")
+    from ..studies import reproduction
+    from ..studies.paper import CASES
+
+    rows = reproduction.run(options.out, tuple(CASES) if options.cases is None else options.cases)
+    print(
+        f"{len(rows)} solves of {', '.join(dict.fromkeys(row.case for row in rows))}; errors "
+        f"against the reference solutions:"
+    )
+    print("\n".join(reproduction.summary(rows)))
+    figures = "fig2" if all(row.case != "A2" for row in rows) else "fig2 and fig3"
+    print(
+        f"The whole table is in {options.out}/table.md (and .json), the figures in {options.out}: "
+        f"{figures} (.png, .pdf)"
+    )
+    return DONE if all(row.converged for row in rows) else NOT_CONVERGED
+
+
+def _effects(options: argparse.Namespace) -> int:
+    jax.config.update("jax_enable_x64", True)
+    from ..studies import effects
+
+    check_folders(options.json)
+    costs = effects.measure(
+        options.batch_size,
+        model=StrainDependent(options.steps),
+        say=lambda name: print(f"compiling: {name}", file=sys.stderr),
+    )
+    print("\n".join(effects.table(costs)))
+    if options.json:
+        save(options.json, [cost._asdict() for cost in costs])
+    return DONE if all(cost.converged == 1 for cost in costs) else NOT_CONVERGED
+
+
+def _two_helices(inputs: list[float] | None) -> Task:
+    from ..studies import paper
+
+    values = np.asarray([-15.0, -15.0] if inputs is None else inputs)
+    scene = paper.scene("B2")
+    return Task(scene, scene.check_inputs(values), None, "B2, two helices")
+
+
+def _accuracy(options: argparse.Namespace) -> int:
+    import matplotlib
+
+    jax.config.update("jax_enable_x64", True)
+    matplotlib.use("Agg")
+    from ..studies import accuracy, accuracy_figures
+
+    check_folders(options.plot, options.json)
+    task = task_of(options) if options.scene else _two_helices(options.inputs)
+    shares = np.random.default_rng(0).uniform(0.1, 1.0, (options.batch_size, task.inputs.size))
+    ways = accuracy.settings(task.scene, groups=options.groups)
+    rows = accuracy.measure(
+        task.scene,
+        jnp.asarray(shares) * task.inputs,
+        ways,
+        say=lambda name: print(f"compiling: {name}", file=sys.stderr),
+    )
+    print("\n".join([*accuracy.table(rows), "", *accuracy.advice(rows)]))
+    named = {task.title or options.scene: rows}
+    if options.json:
+        save(options.json, {name: [row._asdict() for row in some] for name, some in named.items()})
+    if options.plot:
+        accuracy_figures.work_precision(named).savefig(options.plot, dpi=150)
+    return DONE if any(row.tip is not None for row in rows) else NOT_CONVERGED

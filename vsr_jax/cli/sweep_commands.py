@@ -1,0 +1,127 @@
+"""The command `sweep`: a scene file solved for many inputs, a workspace in one command."""
+
+import argparse
+import sys
+import time
+import warnings
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+
+from ..analysis.sweeping import OUTPUTS, Sweep, sweep
+from .common import (
+    DONE,
+    NOT_CONVERGED,
+    add_bounds,
+    bounds,
+    check_folders,
+    command,
+    one_device_a_core,
+    positive,
+)
+from .scene_commands import add_scene, model_between, task_of
+
+
+def add_sweep(commands: Any) -> None:
+    """Adds the command `sweep`."""
+    parser = command(
+        commands,
+        "sweep",
+        help="solve a scene file for many inputs: its workspace",
+        description="Draws inputs evenly between two bounds, solves the scene of a TOML file for "
+        "each, and says where the tip gets.\n"
+        "A sweep to disk that was stopped goes on where it was when the same command is given "
+        "again. Ends with 1 where no\n"
+        "sample converged.",
+        example="vsr-jax sweep scene.toml --samples 100000 --high 10 5 --out workspace.zarr "
+        "--plot workspace.png",
+        run=_sweep,
+    )
+    add_scene(parser)
+    parser.add_argument(
+        "--samples",
+        metavar="N",
+        type=positive,
+        default=10_000,
+        help="how many (default: %(default)s)",
+    )
+    add_bounds(parser, "--inputs, or those of the file")
+    parser.add_argument(
+        "--seed", type=int, default=0, help="of the random numbers (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--outputs",
+        nargs="+",
+        choices=OUTPUTS,
+        default=["tip"],
+        help="what to keep besides the status (default: tip)",
+    )
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        help='a Zarr folder for inputs and outputs, which xarray reads; needs "vsr-jax[sweep]"',
+    )
+    parser.add_argument(
+        "--plot", metavar="FILE", help="draw the tips into a picture: .png, .pdf, .svg"
+    )
+
+
+def _sweep(options: argparse.Namespace) -> int:
+    one_device_a_core()
+    task = task_of(options)
+    check_folders(options.out, options.plot)
+    actuators, dtype = len(task.scene.actuators), task.inputs.dtype
+    low, high = bounds(options.low, options.high, np.asarray(task.inputs))
+    inputs = (
+        np.random.default_rng(options.seed)
+        .uniform(low, high, (options.samples, actuators))
+        .astype(dtype)
+    )
+    model = model_between(task, options.tolerance, low, high)
+    outputs = tuple(dict.fromkeys([*options.outputs, "tip"]))
+    start = time.perf_counter()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("always", message="sweep.out")
+        warnings.showwarning = lambda message, *_, **__: print(
+            f"vsr-jax: {message}", file=sys.stderr
+        )
+        result = sweep(task.scene, inputs, outputs=outputs, model=model, out=options.out)
+    seconds = time.perf_counter() - start
+    tips = np.asarray(result["tip"])[:, :3, 3]
+    print("\n".join(_lines(task.title or options.scene, low, high, result, tips)))
+    print(f"time        {seconds:.1f} s, compiling included")
+    if options.plot:
+        _draw(options.plot, task.title, tips, inputs, low, high)
+    return DONE if np.any(result.converged) else NOT_CONVERGED
+
+
+def _lines(
+    title: str, low: np.ndarray, high: np.ndarray, result: Sweep, tips: np.ndarray
+) -> list[str]:
+    """What a sweep found, in words."""
+    ranges = ", ".join(f"{a:g} to {b:g}" for a, b in zip(low, high, strict=True))
+    counts = ", ".join(f"{number:,} {status}" for status, number in result.counts.items())
+    lines = [title, f"inputs      {ranges}", f"samples     {counts}"]
+    if np.any(result.converged):
+        extents = zip("xyz", np.nanmin(tips, axis=0), np.nanmax(tips, axis=0), strict=True)
+        lines += [f"tip {axis}       {least:.6g} to {most:.6g} m" for axis, least, most in extents]
+    return lines
+
+
+def _draw(
+    path: str, title: str, tips: np.ndarray, inputs: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> None:
+    matplotlib.use("Agg")
+    from ..viz import plot
+
+    varied = high != low  # of many inputs the mean says nothing
+    share = (
+        np.mean((inputs - low)[:, varied] / (high - low)[varied], axis=1)
+        if 0 < np.sum(varied) < 4
+        else None
+    )
+    axes = plot.workspace(tips, values=share, label="mean share of the inputs' range")
+    axes[0].figure.suptitle(title)
+    axes[0].figure.savefig(Path(path), dpi=200)

@@ -1,0 +1,288 @@
+"""Scenes as TOML files: every object is a table with `type = "Helix"` and the arguments of its
+constructor by name.
+
+The top of a file holds the arguments of `Scene` and, if wanted, a `title` and the `inputs`.
+Arguments keep the units of the constructors. Where only one class can stand (`rod`, `material`) the
+type may be left out, and where a profile is expected a plain number will do.
+
+To teach the files a new class, add it to its group below; the arguments are read off its
+constructor and, for writing, off the attributes of the same names.
+"""
+
+import difflib
+import inspect
+import re
+import tomllib
+import uuid
+from operator import attrgetter
+from os import PathLike
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import tomli_w
+from jaxtyping import Array, Float
+
+from ..arm.actuator import Chamber, Tendon, Thread
+from ..arm.loads import DistributedWrench, Gravity, PointWrench, TipWrench
+from ..arm.material import Material
+from ..arm.profile import Constant, Piecewise, PolynomialProfile, SplineProfile, Taper
+from ..arm.rod import Rod
+from ..arm.routing import Helix, Linear, Parallel, Polynomial, Spline
+from ..arm.scene import Scene
+from ..arm.section import Annular, Circular, Elliptic, Joined, Rectangular
+from ..validation import concrete
+
+Group = dict[str, type]
+
+
+def _group(*kinds: type) -> Group:
+    return {kind.__name__: kind for kind in kinds}
+
+
+_PROFILES = _group(Constant, Taper, PolynomialProfile, SplineProfile, Piecewise)
+_SECTIONS = _group(Circular, Annular, Rectangular, Elliptic, Joined)
+_GROUPS = {
+    "rod": _group(Rod),
+    "material": _group(Material),
+    "section": _SECTIONS,
+    "sections": _SECTIONS,
+    "routing": _group(Parallel, Linear, Helix, Polynomial, Spline),
+    "actuators": _group(Thread, Tendon, Chamber),
+    "loads": _group(Gravity, TipWrench, PointWrench, DistributedWrench),
+}
+"""Which classes can stand under a key; profiles under every other."""
+
+_STORED_AS = {
+    (Polynomial, "y"): "y.coefficients",
+    (Polynomial, "z"): "z.coefficients",
+    (Spline, "X"): "y.X",
+    (Spline, "y"): "y.values",
+    (Spline, "z"): "z.values",
+}
+"""Arguments kept in another attribute than the one of their name."""
+
+_NOT_STORED = ((Circular, "diameter"),)
+"""Arguments that say in another way what is stored under another name."""
+
+_DEFAULTS = {(Rod, "rest_strain"): (0.0, 0.0, 0.0, 1.0, 0.0, 0.0)}
+"""What a default of None stands for."""
+
+_FILE_KEYS = ("title", "inputs")
+_SHORT_LIST = re.compile(r"\[\n[^][{}]*\]")
+
+
+class SceneFile(NamedTuple):
+    """What a scene file holds.
+
+    **Fields:** the `scene`; `inputs`, one number an actuator, None if the file gives none; the
+    `title`, free text.
+    """
+
+    scene: Scene
+    inputs: Float[Array, " inputs"] | None = None
+    title: str = ""
+
+
+def load(path: str | PathLike[str]) -> SceneFile:
+    """Reads a scene from a TOML file.
+
+    Numbers take JAX's precision: for float64 set `jax_enable_x64` first.
+
+    **Arguments:** `path`: of the file.
+
+    **Returns:** a `SceneFile`: the scene, its inputs and its title.
+
+    **Raises:** `ValueError` of one line that begins with the file's name, if it cannot be read, is
+    no TOML (with line and column) or holds anything that is unknown, missing or refused by a
+    constructor (with the key's path).
+    """
+    try:
+        return parse_scene(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"{path}: {error.strerror}") from None
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def parse_scene(text: str) -> SceneFile:
+    """The scene in a TOML text, as `load` reads it from a file.
+
+    **Raises:** `ValueError` as `load`, without the file's name.
+    """
+    return parse_table(tomllib.loads(text), "")
+
+
+def parse_table(table: dict[str, Any], path: str) -> SceneFile:
+    """The scene in a table of a TOML file, which lies there under `path`.
+
+    **Raises:** `ValueError` as `load`, without the file's name.
+    """
+    check_keys(Scene, table, path, _FILE_KEYS)
+    title, inputs = table.get("title", ""), table.get("inputs")
+    if not isinstance(title, str):
+        raise ValueError(at(path, f"title: got {title!r}, need text"))
+    scene = _build(
+        Scene, {key: value for key, value in table.items() if key not in _FILE_KEYS}, path
+    )
+    return SceneFile(scene, None if inputs is None else scene.check_inputs(inputs), title)
+
+
+def to_toml(scene: Scene, inputs: Any = None, title: str = "") -> str:
+    """A scene as TOML text, which `parse_scene` reads back to the last bit in the same precision.
+
+    Arguments that have their default value are left out.
+
+    **Arguments:**
+    - `scene`: the scene.
+    - `inputs`: one number an actuator, to be kept with it.
+    - `title`: free text.
+
+    **Raises:** `ValueError` for a scene with Python functions in it or with classes of your own,
+    naming the place; for one that is traced by `jax.jit` or its kin; and for inputs that the scene
+    refuses.
+    """
+    head: dict[str, Any] = {"title": title} if title else {}
+    if inputs is not None:
+        head["inputs"] = _numbers(scene.check_inputs(inputs), "inputs")
+    text = tomli_w.dumps(head | _arguments(scene, ""))
+    return _SHORT_LIST.sub(_on_one_line, text)
+
+
+def save(scene: Scene, path: str | PathLike[str], inputs: Any = None, title: str = "") -> None:
+    """Writes a scene to a TOML file, which `load` reads; see `to_toml` for the arguments and what
+    is refused.
+
+    The file is replaced as a whole, or not at all.
+    """
+    text, file = to_toml(scene, inputs, title), Path(path)
+    part = file.with_name(f".{file.name}.{uuid.uuid4().hex}")
+    try:
+        part.write_text(text, encoding="utf-8")
+        part.replace(file)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _on_one_line(match: re.Match[str]) -> str:
+    # The writer breaks every list; text in quotes has no line breaks, those that there are lie
+    # between the items.
+    return "[" + re.sub(r",?\n\s*", ", ", match[0][1:-1]).strip(", ") + "]"
+
+
+def _read(value: Any, path: str, group: Group) -> Any:
+    if isinstance(value, list):
+        return [_read(item, f"{path}[{i}]", group) for i, item in enumerate(value)]
+    if isinstance(value, dict):
+        kind = kind_of(value, path, group)
+        return _build(kind, {key: item for key, item in value.items() if key != "type"}, path)
+    if group is not _PROFILES:
+        raise ValueError(
+            f"{path}: got {value!r}, need a table of the type {' or '.join(sorted(group))}"
+        )
+    return value
+
+
+def kind_of(table: dict[str, Any], path: str, group: Group) -> type:
+    """The class that a table names in its `type`, one of a group."""
+    known = ", ".join(sorted(group))
+    if "type" not in table:
+        if len(group) == 1:
+            return next(iter(group.values()))
+        raise ValueError(f"{path}: missing key 'type', known types are {known}")
+    name = table["type"]
+    if not isinstance(name, str) or name not in group:
+        raise ValueError(f"{path}: unknown type {name!r}, known are {known}{_guess(name, group)}")
+    return group[name]
+
+
+def _build(kind: type, table: dict[str, Any], path: str) -> Any:
+    check_keys(kind, table, path)
+    arguments = {
+        key: _read(value, _below(path, key), _GROUPS.get(key, _PROFILES))
+        for key, value in table.items()
+    }
+    try:
+        return kind(**arguments)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise ValueError(at(path, " ".join(str(error).split()))) from None
+
+
+def check_keys(kind: type, table: dict[str, Any], path: str, more: tuple[str, ...] = ()) -> None:
+    """Refuses keys that are no arguments of a class, and missing ones that are."""
+    parameters = inspect.signature(kind).parameters
+    known = sorted((*parameters, *more))
+    for key in table:
+        if key not in known:
+            raise ValueError(
+                at(path, f"unknown key {key!r}, known are {', '.join(known)}{_guess(key, known)}")
+            )
+    for name, parameter in parameters.items():
+        if parameter.default is parameter.empty and name not in table:
+            raise ValueError(at(path, f"missing key {name!r}, known are {', '.join(known)}"))
+
+
+def _guess(name: Any, known: Any) -> str:
+    names = {candidate.lower(): candidate for candidate in known}
+    close = difflib.get_close_matches(str(name).lower(), names, n=1)
+    return f"; did you mean {names[close[0]]!r}?" if close else ""
+
+
+def _below(path: str, key: str) -> str:
+    return f"{path}.{key}" if path else key
+
+
+def at(path: str, message: str) -> str:
+    """A message that begins with where it belongs."""
+    return f"{path}: {message}" if path else message
+
+
+def _arguments(value: Any, path: str) -> dict[str, Any]:
+    kind, table = type(value), {}
+    for name, parameter in inspect.signature(kind).parameters.items():
+        if (kind, name) in _NOT_STORED:
+            continue
+        stored = attrgetter(_STORED_AS.get((kind, name), name))(value)
+        if stored is None:
+            continue
+        plain = _write(stored, _below(path, name), _GROUPS.get(name, _PROFILES))
+        if not _same(plain, _DEFAULTS.get((kind, name), parameter.default)):
+            table[name] = plain
+    return table
+
+
+def _write(value: Any, path: str, group: Group) -> Any:
+    if isinstance(value, Constant):
+        return _numbers(value.value, path)
+    if isinstance(value, str | int):
+        return value
+    if isinstance(value, tuple | list):
+        return [_write(item, f"{path}[{i}]", group) for i, item in enumerate(value)]
+    if isinstance(value, float | np.ndarray | Array):
+        return _numbers(value, path)
+    name = type(value).__name__
+    if group.get(name) is not type(value):
+        raise ValueError(
+            f"{path}: a {name} cannot be kept in a scene file; need one of "
+            f"{', '.join(sorted(group))}"
+        )
+    table = _arguments(value, path)
+    return table if len(group) == 1 else {"type": name} | table
+
+
+def _numbers(value: Any, path: str) -> Any:
+    """Numbers as floats: the shortest decimals that give the same numbers in their own
+    precision."""
+    known = concrete(value)
+    if known is None:
+        raise ValueError(f"{path}: a traced value cannot be kept in a scene file")
+    return np.array([float(str(x)) for x in known.ravel()]).reshape(known.shape).tolist()
+
+
+def _same(plain: Any, default: Any) -> bool:
+    if isinstance(plain, list):
+        defaults = default if isinstance(default, tuple | list) else [default] * len(plain)
+        return len(defaults) == len(plain) and all(map(_same, plain, defaults))
+    if isinstance(plain, float) and isinstance(default, int | float):
+        return repr(plain) == repr(float(default))
+    return plain == default

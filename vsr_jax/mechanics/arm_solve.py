@@ -1,0 +1,196 @@
+r"""Solution of the coupled balance (see `coupled`): damped Newton steps with a tangent that is
+nearly exact, and implicit derivatives."""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ..arm.scene import CrossSections
+from ..numerics import component as c
+from ..numerics.batching import arms_in, side_by_side
+from ..numerics.component import Vector
+from ..numerics.implicit import change_of, no_derivative
+from ..numerics.newton import LOAD_SHARES, MOST_TURN, Damped, Solution, damped_newton
+from ..numerics.quadrature import Grid
+from ..typing import cast
+from .arm_balance import (
+    Imbalance,
+    Kind,
+    Problem,
+    State,
+    Unknown,
+    harmless,
+    imbalance_of,
+    pull_of,
+    rounding_of,
+    shape_of,
+    shape_size,
+    state_of,
+    with_tensions,
+)
+from .arm_tangent import approximate_solve, tangent_solve
+from .balance import chosen, solve_balance, spread, with_locked
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(1,))
+def solve_arm(problem: Problem, kind: Kind) -> Solution:
+    """Equilibrium of the arm, from the balance without loads and with slack cables.
+
+    Derivatives are implicit, of any order, in forward and reverse mode: the exact tangent is solved
+    by refining `approximate_solve`.
+    """
+    return side_by_side(partial(_solve, kind))(_start(problem, kind), problem)
+
+
+@partial(solve_arm.defjvp, symbolic_zeros=True)
+def _solve_arm_jvp(
+    kind: Kind, primals: tuple[Problem], tangents: tuple[Problem]
+) -> tuple[Solution, Solution]:
+    solution = solve_arm(primals[0], kind)
+    # Where nothing was found there is no derivative: take it at rest without loads and forces,
+    # where it is finite.
+    sound = solution.balanced & solution.definite
+
+    def placed(change: Imbalance, problem: Problem) -> Unknown:
+        """Unknowns at the solution plus a change of those that are solved for; locked strains are
+        those of the rod at rest."""
+        rest = problem.sections.rest
+        xi = tuple(
+            jnp.where(sound, x, jnp.broadcast_to(r, x.shape))
+            for x, r in zip(solution.unknown.xi, rest, strict=True)
+        )
+        xi = with_locked(c.add(xi, spread(change.wrench, kind.free)), rest, kind.free)
+        others = (tuple(jnp.where(sound, x, 0.0) for x in part) for part in solution.unknown[1:])
+        tension, turning = (c.add(x, dx) for x, dx in zip(others, change[1:], strict=True))
+        return Unknown(xi, tension, turning)
+
+    def imbalance(change: Imbalance, problem: Problem) -> Imbalance:
+        unknown, problem = placed(change, problem), harmless(problem, sound)
+        return imbalance_of(unknown, state_of(unknown, problem, kind), problem, kind)
+
+    free, others = chosen(solution.unknown.xi, kind.free), solution.unknown[1:]
+    still = jax.tree.map(jnp.zeros_like, Imbalance(free, *others))
+    right = change_of(lambda problem: imbalance(still, problem), primals, tangents)
+    change = tangent_solve(
+        lambda change: imbalance(change, primals[0]),
+        placed(still, primals[0]),
+        harmless(primals[0], sound),
+        right,
+        kind,
+    )
+    # the rods' own rest strain moves the locked strains
+    locked = change_of(lambda problem: placed(still, problem).xi, primals, tangents)
+    moved = spread(c.scale(-1.0, change.wrench), kind.free)
+    d_unknown = Unknown(
+        with_locked(moved, locked, kind.free),
+        c.scale(-1.0, change.cable),
+        c.scale(-1.0, change.turning),
+    )
+    return solution, Solution(d_unknown, *no_derivative(*solution[1:]))
+
+
+def _start(problem: Problem, kind: Kind) -> Unknown:
+    """Balance of each section alone, without loads, cables slack and without friction, in single
+    precision."""
+    tension = (jnp.zeros_like(problem.grid.h[0]),) * len(kind.cables)
+    tau = problem.sections.carry(with_tensions(problem.forces, tension, kind))
+    alone = solve_balance(*c.single((problem.sections, tau)), None, kind.free)
+    sound = alone.balanced & alone.definite
+    rest = problem.sections.rest
+    xi = tuple(
+        jnp.where(sound, x.astype(x0.dtype), x0) for x, x0 in zip(alone.xi, rest, strict=True)
+    )
+    xi = with_locked(xi, rest, kind.free)  # these are never corrected
+    return Unknown(xi, tension, (jnp.zeros_like(xi[0]),) * len(kind.frictional))
+
+
+class _Sizes(NamedTuple):
+    """Sizes of steps and imbalances without unit, one for each of the arms side by side (see
+    `shape_size`)."""
+
+    grid: Grid
+    sections: CrossSections
+    kind: Kind
+    arms: tuple[int, ...]
+
+    @property
+    def length(self) -> Array:
+        return jnp.sum(self.grid.h, axis=0)
+
+    def of_step(self, step: Unknown, at: State) -> Array:
+        """Largest change of the shape, of what a tension does to it, or of what friction takes of
+        one."""
+        step = cast(step, self.grid.h.dtype)
+        tensions = [
+            tension * pull_of(self.sections, place, self.length)
+            for place, tension in zip(self.kind.cables, step.tension, strict=True)
+        ]
+        moved = self._largest(shape_size(step.xi, self.length))
+        return sum((self._largest(x) for x in (*tensions, *self._rubbed(step.turning, at))), moved)
+
+    def of_imbalance(self, imbalance: Imbalance, at: State) -> Array:
+        """Root of the mean square of all rows; a cable's is its slack by the arm's length."""
+        wrench = spread(imbalance.wrench, self.kind.free)
+        bent = shape_of(wrench, self.sections.stiffness, self.length)
+        square = jnp.sum(self.grid.weight * bent**2, axis=(0, 1)) / self.length
+        axial = jnp.max(self.sections.stiffness[3], axis=(0, 1))
+        others = (
+            *(force / axial for force in imbalance.cable),
+            *self._rubbed(imbalance.turning, at),
+        )
+        return jnp.sqrt(sum((jnp.mean(x**2, axis=self._inner(x)) for x in others), square))
+
+    def turn(self, step: Unknown) -> Array:
+        """How far the step bends and twists the arm in all [rad]."""
+        x, y, z = (jnp.abs(k) for k in cast(step.xi[:3], self.grid.h.dtype))
+        return jnp.sum(self.grid.weight * (x + y + z), axis=(0, 1))
+
+    def work(self, wrench: Vector, step: Unknown) -> Array:
+        """Work of the imbalance over a step; only its sign and its rough size matter."""
+        work = jnp.sum(
+            c.single(self.grid.weight) * c.dot(wrench, chosen(step.xi, self.kind.free)), axis=(0, 1)
+        )
+        return work.astype(self.grid.h.dtype)
+
+    def _rubbed(self, rates: Vector, at: State) -> list[Array]:
+        """Changes of turning rates by what they make of the tensions."""
+        pulls = [pull_of(self.sections, place, self.length) for place in self.kind.frictional]
+        return [
+            self.length * at.tau[p] * rate * pull
+            for p, rate, pull in zip(self.kind.frictional, rates, pulls, strict=True)
+        ]
+
+    def _inner(self, x: Array) -> tuple[int, ...]:
+        return tuple(range(x.ndim - len(self.arms)))
+
+    def _largest(self, x: Array) -> Array:
+        return jnp.max(jnp.abs(x), axis=self._inner(x))
+
+
+def _solve(kind: Kind, start: Unknown, whole: Problem) -> Solution:
+    arms = arms_in((start, whole), whole.grid.h.ndim - 1)
+    start = jax.tree.map(
+        lambda x: jnp.broadcast_to(x, (*x.shape[: x.ndim - len(arms)], *arms)), start
+    )
+    sizes = _Sizes(whole.grid, whole.sections, kind, arms)
+
+    def evaluate(unknown: Unknown, damping: Array, share: Array) -> Damped:
+        problem = whole.with_share(share)
+        at = state_of(unknown, problem, kind)
+        imbalance = imbalance_of(unknown, at, problem, kind)
+        step, definite = approximate_solve(unknown, at, imbalance, problem, kind, damping)
+        size = sizes.of_step(step, at)
+        # A step that coils the arm may well lower the residual, and lead nowhere.
+        cut = jnp.minimum(1.0, MOST_TURN / jnp.maximum(sizes.turn(step), MOST_TURN))
+        step = jax.tree.map(lambda x: cut.astype(x.dtype) * x, step)
+        return Damped(
+            step, size, c.single(imbalance.wrench), sizes.of_imbalance(imbalance, at), definite
+        )
+
+    shares = 1 if whole.loads is None else LOAD_SHARES
+    return damped_newton(
+        evaluate, sizes.work, start, jnp.broadcast_to(rounding_of(whole), arms), shares
+    )

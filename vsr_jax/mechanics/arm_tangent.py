@@ -1,0 +1,217 @@
+"""The tangent system of the coupled balance (see `coupled`): solved nearly, by elimination, and
+exactly, by refining that."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
+
+from ..numerics import component as c, lu
+from ..numerics.component import Vector
+from ..typing import cast
+from .arm_balance import Imbalance, Kind, Problem, State, Unknown, state_of
+from .balance import chosen, spread, tangent, thread_direction, thread_wrench
+from .elimination import eliminate
+
+_REFINEMENTS = 60
+"""Bound on the steps that refine the solution of a tangent system; five to ten are usual."""
+
+_KEPT = 8
+"""Number of earlier directions to which each new residual is made orthogonal."""
+
+_FINAL, _ACCEPTED = 8.0, 1e4
+"""Residual at which refining ends and residual up to which the solution is accepted, in machine
+epsilons."""
+
+
+def approximate_solve(
+    unknown: Unknown,
+    at: State,
+    right: Imbalance,
+    problem: Problem,
+    kind: Kind,
+    damping: Array | float = 0.0,
+) -> tuple[Unknown, Array]:
+    """Solution of the tangent system, nearly (see `elimination`; friction's own tangent is left
+    out), and whether it is definite for the changes of shape that taut cables allow.
+
+    In single precision throughout, the solution too: the passes along the arm move memory more than
+    they compute, and what is lost is far less than what the elimination leaves out.
+    """
+    unknown, at, right, problem, damping = c.single(
+        (unknown, at, right, problem, jnp.asarray(damping))
+    )
+    sections, grid = problem.sections, problem.grid
+    lower = tangent(unknown.xi, sections, at.tau)
+    lower = tuple(
+        (*row[:-1], row[-1] + damping * s) for row, s in zip(lower, sections.stiffness, strict=True)
+    )
+
+    def solve(b: Vector) -> tuple[Vector, Array]:
+        return eliminate(lower, b, unknown.xi, at.along, problem.loads, grid, kind.free)
+
+    strain, negative = solve(spread(right.wrench, kind.free))
+    if not kind.cables:
+        return Unknown(strain, (), right.turning), negative == 0
+    units = [
+        thread_wrench(thread_direction(unknown.xi, sections.paths[i])[0], sections.paths[i])
+        for i in kind.cables
+    ]
+    pulls = [_times(at.carried[i], unit) for i, unit in zip(kind.cables, units, strict=True)]
+    lengths = [_times(sections.reach[i], unit) for i, unit in zip(kind.cables, units, strict=True)]
+    answers, _ = jax.vmap(solve)(jax.tree.map(lambda *v: jnp.stack(v), *pulls))
+    shortening = jnp.stack(
+        [jnp.sum(grid.weight * c.dot(length, answers), axis=(1, 2)) for length in lengths]
+    )
+    given = jnp.stack(
+        [jnp.sum(grid.weight * c.dot(length, strain), axis=(0, 1)) for length in lengths]
+    )
+    tension, held = _tensions(unknown, at, right, problem, kind, shortening, given)
+    strain = tuple(
+        a - jnp.sum(tension[:, None, None] * answer, axis=0)
+        for a, answer in zip(strain, answers, strict=True)
+    )
+    return Unknown(strain, tuple(tension), right.turning), negative == held
+
+
+def _times(share: Array | None, wrench: Vector) -> Vector:
+    return wrench if share is None else c.scale(share, wrench)
+
+
+def _tensions(
+    unknown: Unknown,
+    at: State,
+    right: Imbalance,
+    problem: Problem,
+    kind: Kind,
+    shortening: Array,
+    given: Array,
+) -> tuple[Array, Array]:
+    """Tensions of the cables from the equations left when the strain is eliminated, and the number
+    of negative pivots of these.
+
+    `shortening`: by each cable of each. Taut cables hold as many motions in which the arm alone
+    would fall as these equations have negative pivots: no more are left where the tangent has no
+    more negative eigenvalues.
+    """
+    rows, sides = [], []
+    for i, (place, cable, tension, slack) in enumerate(
+        zip(kind.cables, problem.cables, unknown.tension, at.slack, strict=True)
+    ):
+        slack_now = tension < cable.scale * slack
+        unit = jnp.zeros_like(given).at[i].set(1.0)
+        row = shortening[i]
+        if cable.compliance is not None:
+            row = row + unit * cable.stretch(at.carried[place], problem.grid)
+        rows.append(jnp.where(slack_now, unit, cable.scale * row))
+        sides.append(jnp.where(slack_now, right.cable[i], right.cable[i] + cable.scale * given[i]))
+    factors = lu.factor(jnp.stack(rows))
+    return lu.substitute(factors, jnp.stack(sides)), jnp.sum(
+        lu.diagonal(factors) < 0, axis=0, dtype=jnp.int32
+    )
+
+
+def tangent_solve(
+    imbalance: Callable, unknown: Unknown, problem: Problem, right: Imbalance, kind: Kind
+) -> Imbalance:
+    r"""Solution of the exact tangent system $A x = b$, with `approximate_solve` as preconditioner;
+    NaN where it is not found.
+
+    Everything is scaled by energies: a change of strain $\delta\xi$ becomes $\sqrt{\Sigma
+    w}\,\delta\xi$, a wrench $\sqrt{w / \Sigma}\,r$, with the weight w of its node, and tensions and
+    turning rates likewise. The scaled A is the identity plus what loads and threads add, symmetric
+    where these have a potential, and its transpose is of the same kind. So one norm serves both
+    modes of differentiation.
+    """
+    still = jax.tree.map(jnp.zeros_like, right)
+    _, matvec = jax.linearize(imbalance, still)
+    at = state_of(unknown, problem, kind)
+    to_row, to_change = lax.stop_gradient(_units(problem, kind, still))
+    _, unravel = ravel_pytree(still)
+
+    def nearly(b: Imbalance) -> Imbalance:
+        step, _ = approximate_solve(unknown, at, b, problem, kind)
+        step = cast(step, problem.grid.h.dtype)
+        return Imbalance(chosen(step.xi, kind.free), step.tension, step.turning)
+
+    def scaled_apply(x: Array) -> Array:
+        return to_row * ravel_pytree(matvec(unravel(to_change * x)))[0]
+
+    def scaled_nearly(b: Array) -> Array:
+        return ravel_pytree(nearly(unravel(b / to_row)))[0] / to_change
+
+    # what does not depend on the right side is done once, before the loop
+    b = to_row * ravel_pytree(right)[0]
+    _, forward = jax.linearize(scaled_nearly, jnp.zeros_like(b))
+    back = jax.linear_transpose(forward, b)
+
+    def solve(apply: Callable, b: Array) -> Array:
+        return _refined(apply, forward, b)
+
+    def transpose_solve(apply: Callable, b: Array) -> Array:
+        return _refined(apply, lambda r: back(r)[0], b)
+
+    return unravel(to_change * lax.custom_linear_solve(scaled_apply, b, solve, transpose_solve))
+
+
+def _units(problem: Problem, kind: Kind, like: Imbalance) -> tuple[Array, Array]:
+    """What makes rows of the residual, and changes of the unknowns from their scaled ones, those of
+    the scaled system."""
+    stiffness, weight = problem.sections.stiffness, problem.grid.weight
+    weight = jnp.maximum(weight, 1e-6 * jnp.max(weight))  # that of an empty step is 0
+    root = tuple(jnp.sqrt(weight * s) for s in chosen(stiffness, kind.free))
+    turn = jnp.sqrt(weight * jnp.minimum(stiffness[1], stiffness[2]))
+    tension = tuple(jnp.sqrt(cable.scale) for cable in problem.cables)
+    rows = Imbalance(
+        tuple(weight / x for x in root),
+        tuple(1 / x for x in tension),
+        (turn,) * len(kind.frictional),
+    )
+    changes = Imbalance(tuple(1 / x for x in root), tension, (1 / turn,) * len(kind.frictional))
+    row, change = (
+        ravel_pytree(jax.tree.map(lambda x, y: jnp.broadcast_to(x, y.shape), tree, like))[0]
+        for tree in (rows, changes)
+    )
+    return row, change
+
+
+def _refined(apply: Callable, nearly: Callable, right: Array) -> Array:
+    """Solution of a scaled system by generalised conjugate residuals with a preconditioner, each
+    step orthogonal to the last few.
+
+    Where an arm is soft the approximate tangent may be ten times too stiff for one of its motions.
+    Refining by the residual alone would then take hundreds of steps; the few directions kept find
+    such a motion at once. What counts as solved is decided by the residual of the result itself.
+    """
+    eps, size = jnp.finfo(right.dtype).eps, jnp.linalg.norm(right)
+
+    def whole(x: Array) -> Array:
+        return jnp.maximum(size, jnp.linalg.norm(x))
+
+    def proceed(carry: tuple) -> Array:
+        x, r, *_, count = carry
+        return (count < _REFINEMENTS) & (jnp.linalg.norm(r) > _FINAL * eps * whole(x))
+
+    def advance(carry: tuple) -> tuple:
+        x, r, P, Q, count = carry
+        p = nearly(r)
+        q = apply(p)
+        for _ in range(2):  # once leaves rounding behind where little is left
+            share = Q @ q
+            p, q = p - share @ P, q - share @ Q
+        square = q @ q
+        inverse = jnp.where(square > 0, 1 / jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+        p, q = inverse * p, inverse * q
+        part = q @ r
+        place = count % _KEPT
+        return x + part * p, r - part * q, P.at[place].set(p), Q.at[place].set(q), count + 1
+
+    kept = jnp.zeros((_KEPT, *right.shape), right.dtype)
+    x, *_ = lax.while_loop(proceed, advance, (jnp.zeros_like(right), right, kept, kept, 0))
+    found = jnp.linalg.norm(right - apply(x)) <= _ACCEPTED * eps * whole(
+        x
+    )  # no derivative rather than a wrong one
+    return jnp.where(found, x, jnp.nan)

@@ -1,0 +1,251 @@
+r"""The balance of a cross-section: the kernel that every model shares.
+
+At every X the rod's elastic wrench, the threads' wrench and the reaction $\Lambda$ to the loads
+beyond X are in balance,
+
+$$r(\xi) = \Sigma (\xi - \xi^*) - B_\tau(\xi) \tau - \Lambda = 0. \qquad (21)$$
+
+Column i of $B_\tau$ is $(d \times t, t) = \partial |t_c| / \partial \xi$, the gradient of thread
+i's length, so the tangent
+
+$$H = \frac{\partial r}{\partial \xi} = \Sigma - A, \quad
+A = \sum_i \frac{\tau_i}{|t_c|} P^T (1 - t t^T) P, \qquad (13)$$
+
+with $P = [-\tilde d, 1]$, is symmetric. Symbols, each a tuple of component arrays of one shape (see
+`component`):
+
+- `xi` $= (k\,[1/m], u\,[-])$: strain, angular first; `rest` $= \xi^*$; `stiffness`: the diagonal of
+  $\Sigma$;
+- $d = (0, d_y, d_z)$ [m]: where a thread crosses the section; $t_c = k \times d + u + d'$ its
+  tangent, $t = t_c / |t_c|$;
+- `tau` [N]: thread force, negative for a tendon; `reaction` $= \Lambda$ [N m, N].
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ..arm.routing import Path, thread_tangent
+from ..arm.scene import CrossSections
+from ..numerics.component import (
+    Matrix,
+    Vector,
+    add,
+    cholesky,
+    cholesky_solve,
+    dot,
+    multiply,
+    scale,
+    single,
+    subtract,
+)
+from ..numerics.implicit import change_of, instantiated, no_derivative
+from ..numerics.newton import Evaluation, newton
+
+ALL = tuple(range(6))
+"""Places of all strains."""
+
+
+class Balance(NamedTuple):
+    """Solution of the balance: strain, whether it was reached, whether $H$ is positive definite
+    there, Newton steps."""
+
+    xi: Vector
+    balanced: Array
+    definite: Array
+    steps: Array
+
+
+def thread_direction(xi: Vector, path: Path) -> tuple[Vector, Array]:
+    """Unit tangent $t$ of a thread and the length $|t_c|$ of its path per unit length of the
+    arm."""
+    t_c = thread_tangent(xi, path)
+    length = jnp.sqrt(dot(t_c, t_c))
+    return tuple(x / length for x in t_c), length
+
+
+def thread_wrench(t: Vector, path: Path) -> Vector:
+    """Wrench of a unit force along $t$ in a thread (eq. 10): $(d \\times t, t)$."""
+    return (path.y * t[2] - path.z * t[1], path.z * t[0], -path.y * t[0], *t)
+
+
+def actuation_wrench(xi: Vector, sections: CrossSections, tau: Vector) -> Vector:
+    """Wrench of all threads (eq. 17): $F_a = B_\\tau(\\xi) \\tau$."""
+    total = tuple(jnp.zeros_like(x) for x in xi)
+    for path, force in zip(sections.paths, tau, strict=True):
+        total = add(total, scale(force, thread_wrench(thread_direction(xi, path)[0], path)))
+    return total
+
+
+def residual(
+    xi: Vector, sections: CrossSections, tau: Vector, reaction: Vector | None = None
+) -> Vector:
+    """Imbalance of a cross-section (eq. 21): $r = \\Sigma (\\xi - \\xi^*) - B_\\tau \\tau -
+    \\Lambda$."""
+    elastic = multiply(sections.stiffness, subtract(xi, sections.rest))
+    r = subtract(elastic, actuation_wrench(xi, sections, tau))
+    return r if reaction is None else subtract(r, reaction)
+
+
+def tangent(xi: Vector, sections: CrossSections, tau: Vector) -> Matrix:
+    """Lower triangle of the tangent stiffness (eq. 12-13): $H = \\Sigma - A$."""
+    zero = jnp.zeros_like(xi[0])
+    rows = [[zero] * i + [sections.stiffness[i]] for i in range(6)]
+    for path, force in zip(sections.paths, tau, strict=True):
+        y, z = path.y, path.z
+        t, length = thread_direction(xi, path)
+        weight = force / length
+        w = [
+            [weight * ((1.0 if i == j else 0.0) - t[i] * t[j]) for j in range(3)] for i in range(3)
+        ]
+        dw = [
+            [y * w[2][j] - z * w[1][j] for j in range(3)],
+            [z * x for x in w[0]],
+            [-y * x for x in w[0]],
+        ]  # d~ W
+        dwd = [[y * row[2] - z * row[1], z * row[0], -y * row[0]] for row in dw]  # d~ W d~^T
+        for i in range(3):
+            for j in range(i + 1):
+                rows[i][j] = rows[i][j] - dwd[i][j]
+                rows[3 + i][3 + j] = rows[3 + i][3 + j] - w[i][j]
+            for j in range(3):
+                rows[3 + i][j] = rows[3 + i][j] - dw[j][i]
+    return tuple(tuple(row) for row in rows)
+
+
+def strain_norm(wrench: Vector, stiffness: Vector) -> Array:
+    r"""Size of a wrench as a strain without unit, $\sqrt{F^T \Sigma^{-1} F / \Sigma_{44}}$: the
+    same for every scale of arm."""
+    return jnp.sqrt(
+        dot(wrench, tuple(f / s for f, s in zip(wrench, stiffness, strict=True))) / stiffness[3]
+    )
+
+
+def rounding_floor(stiffness: Vector, tau: Vector) -> Array:
+    """What is left of `strain_norm` of a balanced residual in floating point: a multiple of the
+    machine's epsilon."""
+    load = sum((jnp.abs(force) for force in tau), jnp.zeros_like(stiffness[3]))
+    return 64 * jnp.finfo(stiffness[3].dtype).eps * (1 + load / stiffness[3])
+
+
+def forces_where(sound: Array, tau: Vector) -> Vector:
+    """Thread forces where the solution is sound and none elsewhere, so that what follows stays
+    finite there."""
+    return tuple(jnp.where(sound, force, 0.0) for force in tau)
+
+
+def chosen(vector: Vector, free: tuple[int, ...]) -> Vector:
+    """Components of the free strains."""
+    return tuple(vector[i] for i in free)
+
+
+def chosen_rows(lower: Matrix, free: tuple[int, ...]) -> Matrix:
+    """Lower triangle of a symmetric matrix that belongs to the free strains."""
+    return tuple(tuple(lower[i][j] for j in free if j <= i) for i in free)
+
+
+def spread(vector: Vector, free: tuple[int, ...]) -> Vector:
+    """Six components from those of the free strains, zero elsewhere."""
+    return tuple(
+        vector[free.index(i)] if i in free else jnp.zeros_like(vector[0]) for i in range(6)
+    )
+
+
+def with_locked(xi: Vector, locked: Vector, free: tuple[int, ...]) -> Vector:
+    """The free strains of `xi` with the others from `locked`."""
+    return tuple(
+        x if i in free else jnp.broadcast_to(y, x.shape)
+        for i, (x, y) in enumerate(zip(xi, locked, strict=True))
+    )
+
+
+def newton_step(
+    xi: Vector, sections: CrossSections, tau: Vector, reaction: Vector | None, free: tuple[int, ...]
+) -> tuple[Vector, Vector]:
+    """Residual $r$ of the free strains and the step $H^{-1} r$ to subtract, whose last is NaN where
+    $H$ is not positive definite.
+
+    The tangent is factored in single precision, at half the cost: of a small step only its first
+    digits matter.
+    """
+    r = chosen(residual(xi, sections, tau, reaction), free)
+    factor = cholesky(chosen_rows(tangent(*single((xi, sections, tau))), free))
+    step = cholesky_solve(factor, single(r))
+    return r, tuple(s.astype(x.dtype) for s, x in zip(step, r, strict=True))
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(3,))
+def solve_balance(
+    sections: CrossSections,
+    tau: Vector,
+    reaction: Vector | None = None,
+    free: tuple[int, ...] = ALL,
+    start: Vector | None = None,
+) -> Balance:
+    r"""Strain that balances each cross-section (eq. 21), by Newton's method from the rest strain.
+
+    Where $H$ is not positive definite the step is $\Sigma^{-1} r$. Derivatives of any order are
+    implicit, $d\xi = -H^{-1} dr$, in forward and reverse mode.
+
+    **Arguments:** component arrays of one shape; `reaction` is left out where there are no external
+    loads; `free`: places of the strains that are solved for, the others keep their rest value;
+    `start`: where to start instead: a section that is pushed under loads may have several balances,
+    and near collapse Newton's method may miss the one there is.
+
+    **Returns:** a `Balance`. `xi` is the last iterate whether or not it is balanced.
+    """
+    stiffness = sections.stiffness
+    shape = jnp.broadcast_shapes(
+        *(x.shape for x in (*stiffness, *sections.rest, *tau, *(reaction or ())))
+    )
+    rest = tuple(jnp.broadcast_to(x, shape) for x in sections.rest)
+    floor = jnp.broadcast_to(rounding_floor(stiffness, tau), shape)
+
+    compliance = tuple(1 / s for s in stiffness)
+
+    def evaluate(xi: Vector) -> Evaluation:
+        r, step = newton_step(xi, sections, tau, reaction, free)
+        elastic = multiply(chosen(compliance, free), r)
+        definite = ~jnp.isnan(step[-1])
+        step = tuple(jnp.where(definite, x, e) for x, e in zip(step, elastic, strict=True))
+        size = jnp.sqrt(dot(step, multiply(chosen(stiffness, free), step)) * compliance[3])
+        return Evaluation(
+            spread(step, free), size, jnp.sqrt(dot(r, elastic) * compliance[3]), definite
+        )
+
+    first = rest if start is None else with_locked(start, rest, free)
+    xi, definite, steps = newton(evaluate, first, floor)
+    imbalance = spread(chosen(residual(xi, sections, tau, reaction), free), free)
+    return Balance(xi, strain_norm(imbalance, stiffness) <= 16 * floor, definite, steps)
+
+
+@partial(solve_balance.defjvp, symbolic_zeros=True)
+def _solve_balance_jvp(
+    free: tuple[int, ...], primals: tuple, tangents: tuple
+) -> tuple[Balance, Balance]:
+    sections, tau, reaction, start = primals
+    solution = solve_balance(sections, tau, reaction, free, start)
+    # Where nothing was balanced there is no derivative: take it at rest without forces, where it is
+    # finite, so that no other lane of a batch is harmed.
+    sound = solution.balanced & solution.definite
+    xi = tuple(
+        jnp.where(sound, x, rest) for x, rest in zip(solution.xi, sections.rest, strict=True)
+    )
+
+    def imbalance(
+        sections: CrossSections, tau: Vector, reaction: Vector | None, _: Vector | None
+    ) -> Vector:
+        return residual(
+            with_locked(xi, sections.rest, free), sections, forces_where(sound, tau), reaction
+        )
+
+    change = change_of(imbalance, primals, tangents)
+    factor = cholesky(chosen_rows(tangent(xi, sections, forces_where(sound, tau)), free))
+    change = spread(scale(-1.0, cholesky_solve(factor, chosen(change, free))), free)
+    return solution, Balance(
+        with_locked(change, instantiated(tangents[0].rest, sections.rest), free),
+        *no_derivative(*solution[1:]),
+    )

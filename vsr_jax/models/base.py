@@ -1,0 +1,254 @@
+"""What every model of a scene offers, and what those that advance by Magnus steps share."""
+
+from abc import abstractmethod
+from dataclasses import replace
+from enum import IntEnum
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..arm.routing import Path, thread_tangent
+from ..arm.scene import CrossSections, Scene, shared
+from ..mechanics.balance import thread_direction, thread_wrench
+from ..mechanics.resolution import COARSE, step_error
+from ..numerics.component import Vector, dot
+from ..numerics.magnus import step_components, step_poses, tip_pose
+from ..numerics.quadrature import Grid, gauss_legendre, locate, make_grid
+from ..numerics.se3 import exp_components, pose
+from ..typing import Pose, Scalar
+
+
+class Status(IntEnum):
+    """How a solve ended; every status but `CONVERGED` comes with a shape of NaN."""
+
+    CONVERGED = 0
+    NOT_CONVERGED = 1
+    UNSTABLE = 2
+    COLLAPSED = 3
+    NOT_FINITE = 4
+    INADMISSIBLE = 5
+    UNDER_RESOLVED = 6
+    BRANCH_LOST = 7
+
+    @property
+    def message(self) -> str:
+        """The status in words."""
+        return _MESSAGES[self]
+
+
+_MESSAGES = {
+    Status.CONVERGED: "converged",
+    Status.NOT_CONVERGED: "the residual could not be brought down to rounding",
+    Status.UNSTABLE: "the equilibrium is not stable: "
+    "the tangent stiffness is not positive definite",
+    Status.COLLAPSED: "collapsed: a thread has shortened its own path, or the arm, to nothing",
+    Status.NOT_FINITE: "an input or an intermediate value is not finite",
+    Status.INADMISSIBLE: "an input lies outside its actuator's range",
+    Status.UNDER_RESOLVED: "under-resolved: the arm bends too fast "
+    "along its length for so few steps",
+    Status.BRANCH_LOST: "the branch could not be followed up to here: its steps became too short",
+}
+
+
+_NOTHING = 1e-4
+"""Share of its length at rest from which on a path counts as shortened to nothing."""
+
+
+class Nodes(NamedTuple):
+    """A grid and, at its nodes, the strain, the cross-sections and the share of each thread's force
+    (None for all of it)."""
+
+    grid: Grid
+    xi: Vector
+    sections: CrossSections
+    shares: tuple[Array | None, ...]
+
+    def tau(self, forces: Vector) -> Vector:
+        """Force of each thread at the nodes."""
+        return shared(forces, self.shares)
+
+
+class Outcome(NamedTuple):
+    """What a model's solve hands back: its own state (finite even where it failed), the thread
+    forces [N] at their start, a `Status` and the Newton steps."""
+
+    state: Any
+    forces: Vector
+    status: Array
+    steps: Array
+
+
+class Model(eqx.Module):
+    """A way to find and to describe the equilibrium of a scene.
+
+    `balanced_everywhere` says whether the balance of the cross-section (eq. 21) holds wherever
+    `strain` is asked for, to rounding or the model's tolerances. Then derivatives and errors may be
+    taken from the balance instead of from `solve`.
+    """
+
+    balanced_everywhere: ClassVar[bool] = False
+
+    @abstractmethod
+    def solve(self, scene: Scene, inputs: Float[Array, " inputs"]) -> Outcome:
+        """Equilibrium for admissible inputs."""
+
+    @abstractmethod
+    def strain(
+        self, scene: Scene, forces: Vector, state: Any, X: Float[Array, " stations"]
+    ) -> Vector:
+        r"""Strain $\xi$ at abscissas X, six component arrays."""
+
+    @abstractmethod
+    def tip(self, scene: Scene, forces: Vector, state: Any) -> Pose:
+        """Pose of the arm's end."""
+
+    @abstractmethod
+    def poses(
+        self, scene: Scene, forces: Vector, state: Any, X: Float[Array, " stations"]
+    ) -> Float[Array, "stations 4 4"]:
+        """Poses at abscissas X."""
+
+    def coordinates(self, scene: Scene, forces: Vector, state: Any) -> Float[Array, " dofs"]:
+        """Coordinates of the strain in the model's basis."""
+        raise ValueError(
+            f"q: got a solution by {type(self).__name__}, need one by StrainDependent or Prescribed"
+        )
+
+    @abstractmethod
+    def nodes(self, scene: Scene, forces: Vector, state: Any) -> Nodes:
+        """What quantities along the arm are summed from."""
+
+    @abstractmethod
+    def finer(self) -> "Model":
+        """The same model with twice the steps, or with tighter tolerances where they are chosen by
+        those."""
+
+    def step_error(self, scene: Scene, forces: Vector, state: Any) -> Scalar | None:
+        """Rough estimate of the tip's error by the steps, as a share of the arm's length; None for
+        steps that adapt themselves."""
+        return None
+
+
+class SteppedModel(Model):
+    """A model whose pose advances by Magnus steps on the strain at their Gauss points."""
+
+    steps: eqx.AbstractVar[int]
+    order: eqx.AbstractVar[int]
+
+    def breakpoints(self, scene: Scene) -> tuple[Array, ...]:
+        """Abscissas [m] where steps break besides those of the scene."""
+        return ()
+
+    def grid(self, scene: Scene) -> Grid:
+        """Steps along the arm and their nodes."""
+        return make_grid(scene.edges(self.breakpoints(scene)), self.steps, self.order // 2)
+
+    def tip(self, scene: Scene, forces: Vector, state: Any) -> Pose:
+        return tip_pose(self.node_strain(scene, state), self.grid(scene).h, scene.rod.base)
+
+    def finer(self) -> "SteppedModel":
+        return replace(self, steps=2 * self.steps)
+
+    def step_error(self, scene: Scene, forces: Vector, state: Any) -> Scalar:
+        nodes = self.nodes(scene, forces, state)
+        sections = nodes.sections._replace(
+            reach=nodes.shares
+        )  # friction takes of a thread's force, no load does
+        return step_error(nodes.xi, sections, forces, nodes.grid, loaded=bool(scene.loads))
+
+    @abstractmethod
+    def node_strain(self, scene: Scene, state: Any) -> Vector:
+        """Strain at the nodes of `grid`, six component arrays of shape (stages, steps)."""
+
+    def poses(
+        self, scene: Scene, forces: Vector, state: Any, X: Float[Array, " stations"]
+    ) -> Float[Array, "stations 4 4"]:
+        grid = self.grid(scene)
+        ends = step_poses(self.node_strain(scene, state), grid.h, scene.rod.base)
+        step, _ = locate(grid, X)
+        h = X - grid.start[step]
+        nodes = gauss_legendre(self.order // 2)[0].astype(h.dtype)
+        X_nodes = grid.start[step] + nodes[:, None] * h
+        strain = self.strain(scene, forces, state, X_nodes.reshape(-1))
+        stages = tuple(
+            tuple(x.reshape(X_nodes.shape)[i] for x in strain) for i in range(len(nodes))
+        )
+        return jax.vmap(jnp.matmul)(ends[step], pose(*exp_components(step_components(stages, h))))
+
+
+def resolved(model: Model, scene: Scene, outcome: Outcome) -> Outcome:
+    """The outcome, with the status under-resolved where it had converged on steps that are too few
+    for its shape."""
+    error = model.step_error(scene, outcome.forces, outcome.state)
+    if error is None:
+        return outcome
+    coarse = (outcome.status == Status.CONVERGED) & ~(error <= COARSE)
+    return outcome._replace(
+        status=jnp.where(coarse, Status.UNDER_RESOLVED, outcome.status).astype(jnp.int32)
+    )
+
+
+def classify(
+    xi: Vector,
+    sections: CrossSections,
+    tau: Vector,
+    balanced: Array,
+    definite: Array,
+    *,
+    loaded: bool = False,
+) -> Array:
+    """`Status` from the strain, whether it balances and whether the tangent is positive definite,
+    over all nodes.
+
+    With tendons alone (not `loaded`) the energy is convex, so a node that cannot be balanced has
+    its least energy at a kink, where the path of a thread has no length left: it has collapsed. So
+    has a node where a path, or the axis, is shortened to less than a ten-thousandth or has turned
+    over, and under loads, where it cannot be balanced, one with a thread that alone would shorten
+    its path to nothing.
+    """
+    pulling = jnp.array(False)
+    if tau and loaded:
+        pulling = jnp.any(
+            jnp.stack(
+                [
+                    _exhausted(force, path, sections)
+                    for force, path in zip(tau, sections.paths, strict=True)
+                ]
+            )
+        )
+    elif tau:
+        pulling = jnp.all(jnp.stack([jnp.all(force <= 0) for force in tau]))
+    left = xi[3] / sections.rest[3]
+    for path, reach in zip(sections.paths, sections.reach, strict=True):
+        rest = thread_tangent(sections.rest, path)
+        share = dot(thread_tangent(xi, path), rest) / dot(rest, rest)
+        left = jnp.minimum(left, share if reach is None else jnp.where(reach > 0, share, 1.0))
+    finite = jnp.all(jnp.isfinite(sum(xi)))
+    collapsed = jnp.any(~balanced & pulling) | jnp.any(left <= _NOTHING)
+    status = jnp.where(jnp.all(balanced), Status.CONVERGED, Status.NOT_CONVERGED)
+    lost = ~jnp.all(definite)
+    status = jnp.where(lost & jnp.all(balanced) if loaded else lost, Status.UNSTABLE, status)
+    status = jnp.where(collapsed, Status.COLLAPSED, status)
+    return jnp.where(finite, status, Status.NOT_FINITE).astype(jnp.int32)
+
+
+def _exhausted(force: Array, path: Path, sections: CrossSections) -> Array:
+    r"""Whether a tendon alone would use up its path at the rate by which it shortens at rest: $T
+    w^T \Sigma^{-1} w \ge |t_c|$."""
+    t, length = thread_direction(sections.rest, path)
+    w = thread_wrench(t, path)
+    return jnp.any(
+        -force * dot(w, tuple(x / s for x, s in zip(w, sections.stiffness, strict=True))) >= length
+    )
+
+
+def rest_where_failed(status: Array, xi: Vector, sections: CrossSections) -> Vector:
+    """`xi`, replaced by the rest strain where the solve failed, so that what follows stays
+    finite."""
+    return tuple(
+        jnp.where(status == Status.CONVERGED, x, rest)
+        for x, rest in zip(xi, sections.rest, strict=True)
+    )

@@ -1,0 +1,262 @@
+r"""Strain bases: $\xi(X) = B_q(X) q + \xi^*(X)$ (eq. 14), $B_q$ of shape (6, n).
+
+A `Basis` gives each strain a `Family` of scalar functions of $s = X / L$ or of X; a strain without
+one is switched off and keeps its rest value. `FunctionBasis` takes the whole matrix as a function
+of X.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..arm.profile import FunctionOfX
+from ..arm.rod import STRAINS
+from ..typing import Scalar
+from ..validation import concrete, count, instance, numbers
+
+
+class Family(eqx.Module):
+    """A family of scalar functions of X."""
+
+    @property
+    @abstractmethod
+    def size(self) -> int:
+        """How many functions there are."""
+
+    @abstractmethod
+    def __call__(self, X: Scalar, length: Scalar) -> Float[Array, " size"]:
+        """Their values at X [m] on an arm of `length` [m]."""
+
+    def breakpoints(self, length: Scalar) -> tuple[Scalar, ...]:
+        """Abscissas [m] where a function or a derivative of it jumps."""
+        return ()
+
+
+class Monomial(Family):
+    """$1, s, \\dots, s^{order}$ with $s = X / L$."""
+
+    order: int = eqx.field(static=True)
+
+    def __init__(self, order: int):
+        self.order = count("Monomial.order", order, least=0)
+
+    @property
+    def size(self) -> int:
+        return self.order + 1
+
+    def __call__(self, X: Scalar, length: Scalar) -> Float[Array, " size"]:
+        s = X / length
+        values = [jnp.ones_like(s)]
+        for _ in range(self.order):
+            values.append(values[-1] * s)
+        return jnp.stack(values)
+
+
+class Legendre(Family):
+    """Legendre polynomials $P_0, \\dots, P_{order}$ of $2 X / L - 1$: orthogonal on the arm, well
+    conditioned at any order."""
+
+    order: int = eqx.field(static=True)
+
+    def __init__(self, order: int):
+        self.order = count("Legendre.order", order, least=0)
+
+    @property
+    def size(self) -> int:
+        return self.order + 1
+
+    def __call__(self, X: Scalar, length: Scalar) -> Float[Array, " size"]:
+        x = 2 * X / length - 1
+        values = [jnp.ones_like(x), x]
+        for i in range(1, self.order):
+            values.append(((2 * i + 1) * x * values[i] - i * values[i - 1]) / (i + 1))
+        return jnp.stack(values[: self.size])
+
+
+class Trigonometric(Family):
+    """$1, \\sin \\omega_i X, \\cos \\omega_i X$ for given angular frequencies; each group by
+    choice.
+
+    **Arguments:**
+    - `frequencies`: $\\omega_i$ [rad/m], a number or several.
+    - `constant`, `sine`, `cosine`: which functions belong to the family.
+    """
+
+    frequencies: Float[Array, " frequencies"]
+    constant: bool = eqx.field(static=True)
+    sine: bool = eqx.field(static=True)
+    cosine: bool = eqx.field(static=True)
+
+    def __init__(
+        self, frequencies: Any, *, constant: bool = True, sine: bool = True, cosine: bool = True
+    ):
+        self.frequencies = jnp.atleast_1d(numbers("Trigonometric.frequencies", frequencies, None))
+        self.constant, self.sine, self.cosine = bool(constant), bool(sine), bool(cosine)
+        if self.frequencies.ndim != 1 or self.size == 0:
+            raise ValueError(
+                "Trigonometric: got no function, need at least one of constant, sine, cosine and "
+                "frequencies in a row"
+            )
+
+    @property
+    def size(self) -> int:
+        return int(self.constant) + self.frequencies.size * (int(self.sine) + int(self.cosine))
+
+    def __call__(self, X: Scalar, length: Scalar) -> Float[Array, " size"]:
+        phase = self.frequencies * X
+        groups = [jnp.ones_like(phase[:1])] if self.constant else []
+        groups += [jnp.sin(phase)] if self.sine else []
+        groups += [jnp.cos(phase)] if self.cosine else []
+        return jnp.concatenate(groups)
+
+
+class PiecewiseConstant(Family):
+    """Indicators of sections of the arm (PCS): one constant strain in each.
+
+    **Arguments:**
+    - `sections`: how many sections of equal length, or the inner ends of the sections as fractions
+      of the length, rising.
+    """
+
+    ends: Float[Array, " inner"]
+
+    def __init__(self, sections: Any):
+        if isinstance(sections, int):
+            sections = np.arange(1, count("PiecewiseConstant.sections", sections)) / sections
+        self.ends = numbers("PiecewiseConstant.sections", sections, None)
+        known = concrete(self.ends)
+        if self.ends.ndim != 1 or (
+            known is not None and not np.all(np.diff(known, prepend=0.0, append=1.0) > 0)
+        ):
+            raise ValueError(
+                f"PiecewiseConstant.sections: got {sections!r}, need an integer, or rising "
+                f"fractions between 0 and 1"
+            )
+
+    @property
+    def size(self) -> int:
+        return self.ends.size + 1
+
+    def __call__(self, X: Scalar, length: Scalar) -> Float[Array, " size"]:
+        section = jnp.searchsorted(self.ends * length, X, side="right")
+        return (jnp.arange(self.size) == section).astype(self.ends.dtype)
+
+    def breakpoints(self, length: Scalar) -> tuple[Scalar, ...]:
+        return tuple(end * length for end in self.ends)
+
+
+class Functions(Family):
+    """Any scalar functions: values = `function(X, *parameters)`, an array of `size` numbers, X in
+    metres."""
+
+    function: FunctionOfX
+    _size: int = eqx.field(static=True)
+
+    def __init__(self, function: Callable, *parameters: Any, size: int):
+        self.function = FunctionOfX("Functions", function, *parameters)
+        self._size = count("Functions.size", size)
+
+    @property
+    def size(self) -> int:
+        return self._size
+
+    def __call__(self, X: Scalar, length: Scalar) -> Float[Array, " size"]:
+        return self.function(X)
+
+
+class AbstractBasis(eqx.Module):
+    """A basis of the strain field."""
+
+    @property
+    @abstractmethod
+    def size(self) -> int:
+        """Number of degrees of freedom n."""
+
+    @abstractmethod
+    def matrix(self, X: Scalar, length: Scalar) -> Float[Array, "6 dofs"]:
+        """$B_q(X)$, shape (6, n)."""
+
+    @property
+    def strains(self) -> tuple[str, ...]:
+        """Names of the strains it frees."""
+        return STRAINS
+
+    def breakpoints(self, length: Scalar) -> tuple[Scalar, ...]:
+        """Abscissas [m] where the basis or a derivative of it jumps."""
+        return ()
+
+
+class Basis(AbstractBasis):
+    """Each strain with its own family; coordinates are ordered strain by strain.
+
+    **Arguments:** `families`: maps strain names (torsion, bending_y, bending_z, elongation,
+    shear_y, shear_z) to families. Strains that are not named are switched off.
+
+    **Raises:** `ValueError` for an unknown strain name or for no strain at all.
+    """
+
+    families: dict[str, Family]
+
+    def __init__(self, families: Mapping[str, Family]):
+        for name, family in families.items():
+            if name not in STRAINS:
+                raise ValueError(
+                    f"Basis: got an unknown strain {name!r}, need names among {', '.join(STRAINS)}"
+                )
+            instance(
+                f"Basis[{name!r}]",
+                family,
+                Family,
+                "a family such as Legendre, Monomial or Trigonometric",
+            )
+        if not families:
+            raise ValueError("Basis: got no strain, need at least one")
+        self.families = dict(families)
+
+    @property
+    def strains(self) -> tuple[str, ...]:
+        return tuple(self.families)
+
+    @classmethod
+    def uniform(cls, family: Family, strains: tuple[str, ...] = STRAINS) -> "Basis":
+        """The same family for each of `strains`, all six by default."""
+        return cls({name: family for name in strains})
+
+    @property
+    def size(self) -> int:
+        return sum(family.size for family in self.families.values())
+
+    def matrix(self, X: Scalar, length: Scalar) -> Float[Array, "6 dofs"]:
+        blocks = []
+        for row, name in enumerate(STRAINS):
+            if name in self.families:
+                values = self.families[name](X, length)
+                blocks.append(jnp.zeros((6, values.size), values.dtype).at[row].set(values))
+        return jnp.concatenate(blocks, axis=1)
+
+    def breakpoints(self, length: Scalar) -> tuple[Scalar, ...]:
+        distinct = {id(family): family for family in self.families.values()}
+        return tuple(x for family in distinct.values() for x in family.breakpoints(length))
+
+
+class FunctionBasis(AbstractBasis):
+    """Any matrix: $B_q(X) =$ `function(X, *parameters)`, shape (6, `size`), X in metres."""
+
+    function: FunctionOfX
+    _size: int = eqx.field(static=True)
+
+    def __init__(self, function: Callable, *parameters: Any, size: int):
+        self.function = FunctionOfX("FunctionBasis", function, *parameters)
+        self._size = count("FunctionBasis.size", size)
+
+    @property
+    def size(self) -> int:
+        return self._size
+
+    def matrix(self, X: Scalar, length: Scalar) -> Float[Array, "6 dofs"]:
+        return self.function(X)

@@ -1,0 +1,308 @@
+r"""The model with a prescribed basis (eq. 14-18): $K q = B(q) \tau$ by Gauss quadrature and
+Newton's method."""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..arm.scene import CrossSections, Scene
+from ..mechanics.arm_balance import problem_of, with_tensions
+from ..mechanics.balance import (
+    forces_where,
+    residual,
+    rounding_floor,
+    tangent,
+    thread_direction,
+    thread_wrench,
+)
+from ..numerics import component as c, lu
+from ..numerics.component import Vector
+from ..numerics.implicit import change_of, no_derivative
+from ..numerics.magnus import ORDERS, accumulate_jacobian
+from ..numerics.newton import Evaluation, newton
+from ..numerics.quadrature import Grid, make_grid, onto
+from ..typing import Scalar
+from ..validation import ROUNDING, choice, count, instance, on_arm
+from . import prescribed_loaded
+from .base import Nodes, Outcome, Status, SteppedModel, classify
+from .basis import AbstractBasis
+from .prescribed_loaded import solve_prescribed
+
+
+class Projection(NamedTuple):
+    """A basis and the cross-sections at the quadrature points: `weight` [m] of each, `matrix` $B_q$
+    (points, 6, n)."""
+
+    sections: CrossSections
+    weight: Float[Array, " points"]
+    matrix: Float[Array, "points 6 dofs"]
+
+    def strain(self, q: Float[Array, " dofs"]) -> Vector:
+        """Strain $B_q q + \\xi^*$ at the points, six component arrays (eq. 14)."""
+        return c.add(c.split(self.matrix @ q), self.sections.rest)
+
+    def integrate(self, wrench: Vector) -> Float[Array, " dofs"]:
+        """Generalised force $\\int B_q^T F \\, dX$."""
+        return jnp.einsum("x,xia,xi->a", self.weight, self.matrix, c.join(wrench))
+
+    def stiffness(self, lower: c.Matrix) -> Float[Array, "dofs dofs"]:
+        """Generalised stiffness $\\int B_q^T H B_q \\, dX$ of a symmetric $H$ given by its lower
+        triangle."""
+        weighted = self.weight[:, None, None] * (c.join_matrix(c.symmetric(lower)) @ self.matrix)
+        return jnp.einsum("xia,xib->ab", self.matrix, weighted)
+
+    def elastic_stiffness(self) -> Float[Array, "dofs dofs"]:
+        """$K = \\int B_q^T \\Sigma B_q \\, dX$."""
+        weighted = (self.weight[:, None] * c.join(self.sections.stiffness))[..., None] * self.matrix
+        return jnp.einsum("xia,xib->ab", self.matrix, weighted)
+
+
+def project(scene: Scene, basis: AbstractBasis, points: int) -> Projection:
+    """Basis and cross-sections at `points` Gauss points on each smooth piece of the arm."""
+    length = scene.rod.length
+    grid = make_grid(scene.edges(basis.breakpoints(length)), 1, points)
+    X = grid.X.reshape(-1)
+    matrix = jax.vmap(lambda x: basis.matrix(x, length))(X)
+    return Projection(scene.sections(X), grid.weight.reshape(-1), matrix)
+
+
+@jax.custom_jvp
+def solve_projected(
+    projection: Projection, tau: Vector
+) -> tuple[Float[Array, " dofs"], Array, Array, Array]:
+    r"""Coordinates q with $K q = B(q) \tau$ (eq. 18), by Newton's method on the symmetric tangent
+    $K - \partial (B \tau) / \partial q$.
+
+    **Returns:** q, whether the residual is balanced, whether the tangent is positive definite, and
+    the Newton steps. Derivatives of any order are implicit.
+    """
+    K = projection.elastic_stiffness()
+    elastic = lu.factor(K)
+    axial = jnp.sum(projection.weight * projection.sections.stiffness[3])
+
+    def norm(force: Array, change: Array) -> Array:
+        return jnp.sqrt(jnp.maximum(force @ change, 0.0) / axial)
+
+    def imbalance(q: Array) -> Array:
+        return projection.integrate(residual(projection.strain(q), projection.sections, tau))
+
+    def evaluate(q: Array) -> Evaluation:
+        r = imbalance(q)
+        factors = lu.factor(
+            projection.stiffness(tangent(projection.strain(q), projection.sections, tau))
+        )
+        definite, relaxed = jnp.all(lu.diagonal(factors) > 0), lu.substitute(elastic, r)
+        step = jnp.where(definite, lu.substitute(factors, r), relaxed)
+        return Evaluation(step, norm(K @ step, step), norm(r, relaxed), definite)
+
+    floor = jnp.max(rounding_floor(projection.sections.stiffness, tau)) * K.shape[0] ** 0.5
+    q, definite, steps = newton(evaluate, jnp.zeros(K.shape[0], K.dtype), floor)
+    left = imbalance(q)
+    return q, norm(left, lu.substitute(elastic, left)) <= 16 * floor, definite, steps
+
+
+@partial(solve_projected.defjvp, symbolic_zeros=True)
+def _solve_projected_jvp(primals: tuple, tangents: tuple) -> tuple:
+    projection, tau = primals
+    q, balanced, definite, steps = solve_projected(projection, tau)
+    sound = balanced & definite
+    q_sound = jnp.where(sound, q, 0.0)
+
+    def imbalance(projection: Projection, tau: Vector) -> Array:
+        return projection.integrate(
+            residual(projection.strain(q_sound), projection.sections, forces_where(sound, tau))
+        )
+
+    change = change_of(imbalance, primals, tangents)
+    H = projection.stiffness(
+        tangent(projection.strain(q_sound), projection.sections, forces_where(sound, tau))
+    )
+    return (q, balanced, definite, steps), (
+        -lu.solve(H, change),
+        *no_derivative(balanced, definite, steps),
+    )
+
+
+class Prescribed(SteppedModel):
+    r"""Strain in a given basis, $\xi = B_q(X) q + \xi^*$, with $K q = B(q) \tau$ (eq. 18).
+
+    **Arguments:**
+    - `basis`: an `AbstractBasis`, such as `Basis.uniform(Legendre(4))`.
+    - `points`: Gauss points of the quadrature of $K$ and $B(q)$ on each smooth piece of the arm.
+      With loads, given thread lengths or friction the quadrature is that of the pose steps instead.
+    - `steps`, `order`: pose steps as for `StrainDependent`.
+
+    **Raises:** `ValueError` on solving a scene that locks a strain the basis frees.
+    """
+
+    basis: AbstractBasis
+    points: int = eqx.field(static=True)
+    steps: int = eqx.field(static=True)
+    order: int = eqx.field(static=True)
+
+    def __init__(self, basis: AbstractBasis, points: int = 32, steps: int = 32, order: int = 6):
+        self.basis = instance(
+            "Prescribed.basis", basis, AbstractBasis, "a basis such as Basis.uniform(Legendre(4))"
+        )
+        self.points = count("Prescribed.points", points)
+        self.steps = count("Prescribed.steps", steps)
+        self.order = choice("Prescribed.order", order, ORDERS)
+
+    def breakpoints(self, scene: Scene) -> tuple[Array, ...]:
+        return self.basis.breakpoints(scene.rod.length)
+
+    def solve(self, scene: Scene, inputs: Float[Array, " inputs"]) -> Outcome:
+        self._check_strains(scene)
+        if scene.coupled:
+            return self._solve_together(scene, inputs)
+        projection, forces = project(scene, self.basis, self.points), scene.forces(inputs)
+        tau = projection.sections.carry(forces)
+        q, balanced, definite, steps = solve_projected(projection, tau)
+        status = classify(projection.strain(q), projection.sections, tau, balanced, definite)
+        return Outcome(jnp.where(status == Status.CONVERGED, q, 0.0), forces, status, steps)
+
+    def _solve_together(self, scene: Scene, inputs: Float[Array, " inputs"]) -> Outcome:
+        problem, kind = problem_of(scene, inputs, self.grid(scene))
+        basis = self._at_nodes(scene, problem.grid)
+        (q, tensions), balanced, definite, steps = solve_prescribed(basis, problem, kind)
+        forces = with_tensions(problem.forces, tensions, kind)
+        xi = prescribed_loaded.strain(q, basis, problem)
+        tau = problem.sections.carry(forces)
+        status = classify(xi, problem.sections, tau, balanced, definite, loaded=bool(scene.loads))
+        sound = status == Status.CONVERGED
+        return Outcome(jnp.where(sound, q, 0.0), forces_where(sound, forces), status, steps)
+
+    def _at_nodes(self, scene: Scene, grid: Grid) -> prescribed_loaded.Basis:
+        X = grid.X.reshape(-1)
+
+        def at(x: Scalar) -> Array:
+            return self.basis.matrix(x, scene.rod.length)
+
+        def with_rate(x: Scalar) -> tuple[Array, Array]:
+            return jax.jvp(at, (x,), (jnp.ones_like(x),))
+
+        matrix, rate = jax.vmap(with_rate)(X) if scene.frictional else (jax.vmap(at)(X), None)
+        shape = (*grid.X.shape, 6, self.basis.size)
+        return prescribed_loaded.Basis(
+            matrix.reshape(shape), None if rate is None else rate.reshape(shape)
+        )
+
+    def _check_strains(self, scene: Scene) -> None:
+        freed = self.basis.strains
+        locked = [name for name in freed if name not in scene.free_strains]
+        if locked:
+            raise ValueError(
+                f"Prescribed.basis: got one that frees {', '.join(locked)}, need only "
+                f"{', '.join(scene.free_strains)}, as the scene"
+            )
+
+    def coordinates(self, scene: Scene, forces: Vector, state: Array) -> Float[Array, " dofs"]:
+        return state
+
+    def node_strain(self, scene: Scene, state: Array) -> Vector:
+        X = self.grid(scene).X
+        return tuple(x.reshape(X.shape) for x in self._strain(scene, state, X.reshape(-1)))
+
+    def nodes(self, scene: Scene, forces: Vector, state: Array) -> Nodes:
+        grid = self.grid(scene)
+        xi, sections = self.node_strain(scene, state), scene.sections(grid.X)
+        if not scene.frictional:
+            return Nodes(grid, xi, sections, sections.reach)
+        problem, kind = problem_of(scene, jnp.zeros(len(scene.actuators), grid.h.dtype), grid)
+        return Nodes(
+            grid,
+            xi,
+            sections,
+            prescribed_loaded.shares(xi, state, self._at_nodes(scene, grid), problem, kind),
+        )
+
+    def strain(
+        self, scene: Scene, forces: Vector, state: Array, X: Float[Array, " stations"]
+    ) -> Vector:
+        return self._strain(scene, state, X)
+
+    def _strain(self, scene: Scene, state: Array, X: Float[Array, " stations"]) -> Vector:
+        def at(x: Scalar) -> Vector:
+            return c.add(c.split(self.basis.matrix(x, scene.rod.length) @ state), scene.rod.rest(x))
+
+        return jax.vmap(at)(X)
+
+
+def stiffness_matrix(
+    scene: Scene, basis: AbstractBasis, *, points: int = 32
+) -> Float[Array, "dofs dofs"]:
+    r"""Generalised stiffness (eq. 18): $K = \int_0^L B_q^T \Sigma B_q \, dX$.
+
+    **Arguments:** `points`: Gauss points on each smooth piece of the arm.
+
+    **Returns:** symmetric matrix, shape (n, n), positive definite if the basis is linearly
+    independent.
+    """
+    return project(scene, basis, points).elastic_stiffness()
+
+
+def actuation_matrix(
+    scene: Scene, basis: AbstractBasis, q: Float[Array, " dofs"], *, points: int = 32
+) -> Float[Array, "dofs threads"]:
+    r"""Generalised actuation matrix (eq. 18): $B(q) = \int_0^L B_q^T B_\tau(q) \, dX$, the
+    transpose of $\partial l / \partial q$.
+
+    **Arguments:**
+    - `q`: coordinates, shape (n,).
+    - `points`: Gauss points on each smooth piece of the arm.
+
+    **Returns:** shape (n, threads).
+    """
+    projection = project(scene, basis, points)
+    xi = projection.strain(q)
+    ones = tuple(jnp.ones((), q.dtype) for _ in scene.actuators)
+    sections = projection.sections
+    columns = []
+    for path, share in zip(sections.paths, sections.carry(ones), strict=True):
+        columns.append(
+            projection.integrate(c.scale(share, thread_wrench(thread_direction(xi, path)[0], path)))
+        )
+    return jnp.stack(columns, axis=1)
+
+
+def jacobian(
+    scene: Scene,
+    basis: AbstractBasis,
+    q: Float[Array, " dofs"],
+    X: Any = None,
+    *,
+    steps: int = 32,
+    order: int = 6,
+) -> Float[Array, "6 dofs"]:
+    r"""Geometric Jacobian (eq. 15): $J(q, X) = \mathrm{Ad}_g^{-1} \int_0^X \mathrm{Ad}_g B_q \,
+    ds$.
+
+    The body twist of the section at X is $\eta = J \dot q$. It is the exact derivative of the pose
+    steps, hence of their order.
+
+    **Arguments:**
+    - `q`: coordinates, shape (n,).
+    - `X`: abscissa [m], the tip by default.
+    - `steps`, `order`: steps on [0, X] and their order.
+
+    **Returns:** shape (6, n), angular part first; NaN for a traced X beyond the arm.
+
+    **Raises:** `ValueError` for X beyond the arm.
+    """
+    length = scene.rod.length
+    on_arm("X", length if X is None else X, length)
+    end, near = onto(
+        length if X is None else jnp.asarray(X, length.dtype), 0.0, length, ROUNDING * length
+    )
+    edges = jnp.minimum(scene.edges(basis.breakpoints(length)), end)
+    grid = make_grid(edges, steps, choice("order", order, ORDERS) // 2)
+    nodes = grid.X.T.reshape(-1)
+    matrix = jax.vmap(lambda x: basis.matrix(x, length))(nodes)
+    xi = matrix @ q + c.join(scene.sections(nodes).rest)
+    shape = grid.X.T.shape
+    J = accumulate_jacobian(xi.reshape(*shape, 6), matrix.reshape(*shape, 6, -1), grid.h)
+    return jnp.where(near, J, jnp.nan)

@@ -1,0 +1,303 @@
+r"""The loaded model in a prescribed basis: $K q = B(q) \tau + \int B_q^T \Lambda \, dX$, with given
+thread lengths and friction.
+
+The load term is the virtual work of the loads, integrated by parts: one pass of rotations up the
+arm and one of wrenches down it (see `reaction`), no assembled Jacobian. Unknown are the coordinates
+and the tension of each tendon driven by its length. Newton's tangent is that of the integrals,
+$\int B_q^T (H B_q - \delta\Lambda) dX$, for all coordinates at once and in single precision;
+derivatives of the solution take the exact one of the steps, by forward differentiation.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..arm.scene import shared
+from ..mechanics.arm_balance import Kind, Problem, harmless, pull_of, rounding_of, with_tensions
+from ..mechanics.balance import residual, tangent, thread_direction, thread_wrench
+from ..mechanics.cable import path_length
+from ..mechanics.friction import kinks_of, share_left, turning_rate
+from ..mechanics.reaction import Reaction, react, reaction_change
+from ..numerics import component as c, lu
+from ..numerics.batching import arms_in, side_by_side
+from ..numerics.component import Vector
+from ..numerics.implicit import change_of, no_derivative
+from ..numerics.newton import LOAD_SHARES, MOST_TURN, Damped, Solution, damped_newton
+from ..numerics.quadrature import Grid
+
+
+class Unknown(NamedTuple):
+    """Coordinates, and tension [N] of each cable."""
+
+    q: Float[Array, "dofs *arms"]
+    tension: Float[Array, "cables *arms"]
+
+
+class Basis(NamedTuple):
+    r"""The basis at the nodes, $B_q$, shape (stages, steps, 6, n), and its change along the arm
+    (None without friction)."""
+
+    matrix: Array
+    rate: Array | None
+
+
+class At(NamedTuple):
+    """What follows from the unknowns: strain at the nodes, share of each thread's force there, its
+    force, the reaction, and the slack of each cable [m]."""
+
+    xi: Vector
+    shares: tuple[Array | None, ...]
+    tau: Vector
+    along: Reaction | None
+    slack: Vector
+
+
+def strain(q: Array, basis: Basis, problem: Problem) -> Vector:
+    r"""Strain at the nodes, $\xi = B_q q + \xi^*$."""
+    return c.add(_combined(basis.matrix, q), problem.sections.rest)
+
+
+def _combined(matrix: Array, q: Array) -> Vector:
+    """$B_q q$, six component arrays at the nodes."""
+    return tuple(jnp.einsum("cija...,a...->cij...", jnp.moveaxis(matrix, 2, 0), q))
+
+
+def _projected(matrix: Array, wrench: Vector, grid: Grid) -> Array:
+    r"""Generalised force $\int B_q^T F \, dX$."""
+    weighted = jnp.stack([grid.weight * f for f in jnp.broadcast_arrays(*wrench)])
+    return jnp.einsum("ijca...,cij...->a...", matrix, weighted)
+
+
+def _gathered(matrix: Array, wrenches: Vector, grid: Grid) -> Array:
+    r"""Generalised forces of wrenches that stand in an axis behind the nodes, in columns."""
+    weighted = jnp.stack(
+        [jnp.expand_dims(grid.weight, 2) * f for f in jnp.broadcast_arrays(*wrenches)]
+    )
+    return jnp.einsum("ijca...,cijb...->ab...", matrix, weighted)
+
+
+def shares(
+    xi: Vector, q: Array, basis: Basis, problem: Problem, kind: Kind
+) -> tuple[Array | None, ...]:
+    """Share of each thread's force at the nodes."""
+    shares = list(problem.sections.reach)
+    if problem.friction is None or basis.rate is None:
+        return tuple(shares)
+    rate = problem.friction.sections_rate
+    xi_rate = c.add(_combined(basis.rate, q), rate.rest)
+    for place, mu in zip(kind.frictional, problem.friction.coefficients, strict=True):
+        kinks = kinks_of(xi, problem.sections, problem.friction.breaks, place, problem.grid)
+        turning = turning_rate(xi, xi_rate, problem.sections, rate, place)
+        shares[place] = share_left(shares[place], turning, kinks, mu, problem.grid)
+    return tuple(shares)
+
+
+def state_of(unknown: Unknown, basis: Basis, problem: Problem, kind: Kind) -> At:
+    """What follows from the unknowns."""
+    grid, xi = problem.grid, strain(unknown.q, basis, problem)
+    share = shares(xi, unknown.q, basis, problem, kind)
+    tau = shared(with_tensions(problem.forces, unknown.tension, kind), share)
+    along = None if problem.loads is None else react(xi, grid, problem.loads)
+    slack = tuple(
+        cable.slack(tension, path_length(xi, problem.sections, place, grid), share[place], grid)
+        for place, cable, tension in zip(kind.cables, problem.cables, unknown.tension, strict=True)
+    )
+    return At(xi, share, tau, along, slack)
+
+
+def imbalance(unknown: Unknown, at: At, basis: Basis, problem: Problem) -> Unknown:
+    """Residual: generalised force, and for each cable the lesser of tension and scaled slack
+    [N]."""
+    r = residual(at.xi, problem.sections, at.tau, None if at.along is None else at.along.wrench)
+    rows = [
+        cable.complementarity(tension, slack)
+        for cable, tension, slack in zip(problem.cables, unknown.tension, at.slack, strict=True)
+    ]
+    return Unknown(
+        _projected(basis.matrix, r, problem.grid), jnp.stack(rows) if rows else unknown.tension
+    )
+
+
+def approximate_tangent(
+    unknown: Unknown, at: At, basis: Basis, problem: Problem, kind: Kind
+) -> Array:
+    """Derivative of the residual, friction's own part left out, to the order of the nodes'
+    quadrature and in single precision."""
+    unknown, at, basis, problem = c.single((unknown, at, basis, problem))
+    sections, grid, matrix = problem.sections, problem.grid, basis.matrix
+    columns = tuple(
+        matrix[:, :, i] for i in range(6)
+    )  # the coordinates in an axis behind the nodes
+    behind = grid.h.ndim - 1
+
+    def beside(tree: c.Tree) -> c.Tree:
+        return jax.tree.map(lambda x: jnp.expand_dims(x, x.ndim - behind), tree)
+
+    change = c.matvec(c.symmetric(beside(tangent(at.xi, sections, at.tau))), columns)
+    if at.along is not None and problem.loads is not None:
+        change = c.subtract(
+            change, reaction_change(columns, *beside((at.along, grid, problem.loads)))
+        )
+    K = _gathered(matrix, change, grid)
+    if not kind.cables:
+        return K
+    units = [
+        thread_wrench(thread_direction(at.xi, sections.paths[i])[0], sections.paths[i])
+        for i in kind.cables
+    ]
+    pulls = [
+        _projected(matrix, c.scale(_one(at.shares[i]), unit), grid)
+        for i, unit in zip(kind.cables, units, strict=True)
+    ]
+    lengths = [
+        _projected(matrix, c.scale(_one(sections.reach[i]), unit), grid)
+        for i, unit in zip(kind.cables, units, strict=True)
+    ]
+    rows = []
+    for i, (place, cable, tension, slack) in enumerate(
+        zip(kind.cables, problem.cables, unknown.tension, at.slack, strict=True)
+    ):
+        loose, unit = (
+            tension < cable.scale * slack,
+            (jnp.arange(len(units)) == i).astype(K.dtype).reshape(-1, *(1,) * behind),
+        )
+        by_q = jnp.where(loose, 0.0, -cable.scale * lengths[i])
+        by_tension = unit * jnp.where(
+            loose, 1.0, cable.scale * cable.stretch(at.shares[place], grid)
+        )
+        rows.append(jnp.concatenate([by_q, by_tension]))
+    return jnp.concatenate(
+        [jnp.concatenate([K, jnp.stack(pulls, axis=1)], axis=1), jnp.stack(rows)]
+    )
+
+
+def _one(share: Array | None) -> Array | float:
+    return 1.0 if share is None else share
+
+
+class _Sizes(NamedTuple):
+    """Sizes of changes: `gram` G with $q^T G q$ the mean square of a change's `shape_size`, the
+    factors of K, the shape that each cable's tension makes [1/N], and a stiffness [N] by which the
+    slack of cables is compared."""
+
+    gram: Float[Array, "dofs dofs *arms"]
+    factors: Float[Array, "dofs dofs *arms"]
+    pulls: Float[Array, "cables *arms"]
+    axial: Array
+
+    def turn(self, q: Array) -> Array:
+        """Root of the mean square of a change of shape along the arm."""
+        return jnp.sqrt(jnp.maximum(jnp.sum(q * jnp.sum(self.gram * q, axis=1), axis=0), 0.0))
+
+    def of_step(self, step: Unknown) -> Array:
+        """Size of a change of the unknowns."""
+        return self.turn(step.q) + jnp.sum(self.pulls * jnp.abs(step.tension), axis=0)
+
+    def of_imbalance(self, r: Unknown) -> Array:
+        """Size of the change that an imbalance makes of an arm at rest."""
+        square = self.turn(lu.substitute(self.factors, r.q)) ** 2
+        return jnp.sqrt(square + jnp.sum((r.tension / self.axial) ** 2, axis=0))
+
+
+def _sizes_of(basis: Basis, K: Array, problem: Problem, kind: Kind) -> _Sizes:
+    grid, sections = problem.grid, problem.sections
+    length = jnp.sum(grid.h, axis=0)
+    gram = [
+        w * jnp.einsum("ija...,ijb...,ij...->ab...", m, m, grid.weight / length)
+        for m, w in _by_strain(basis.matrix, length)
+    ]
+    pulls = [jnp.max(pull_of(sections, place, length), axis=(0, 1)) for place in kind.cables]
+    axial = jnp.max(sections.stiffness[3], axis=(0, 1))
+    return _Sizes(
+        sum(gram[1:], gram[0]),
+        lu.factor(K),
+        jnp.stack(pulls) if pulls else jnp.zeros((0, *length.shape), K.dtype),
+        axial,
+    )
+
+
+def _by_strain(matrix: Array, length: Array) -> list[tuple[Array, Array | float]]:
+    return [(matrix[:, :, i], length**2 if i < 3 else 1.0) for i in range(6)]
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(2,))
+def solve_prescribed(basis: Basis, problem: Problem, kind: Kind) -> Solution:
+    """Equilibrium in the basis, by damped Newton steps from rest. Derivatives are implicit, of any
+    order."""
+    return side_by_side(partial(_solve, kind))(basis, problem)
+
+
+def _solve(kind: Kind, basis: Basis, problem: Problem) -> Solution:
+    stiffness = problem.sections.stiffness
+    behind = problem.grid.h.ndim - 1
+    arms = arms_in((basis, problem), behind)
+    columns = tuple(basis.matrix[:, :, i] for i in range(6))
+    strained = tuple(
+        jnp.expand_dims(s, s.ndim - behind) * column
+        for s, column in zip(stiffness, columns, strict=True)
+    )
+    K = _gathered(basis.matrix, strained, problem.grid)
+    sizes = _sizes_of(basis, K, problem, kind)
+    size = K.shape[0]
+
+    def evaluate(unknown: Unknown, damping: Array, share: Array) -> Damped:
+        part = problem.with_share(share)
+        at = state_of(unknown, basis, part, kind)
+        r = imbalance(unknown, at, basis, part)
+        J = approximate_tangent(unknown, at, basis, part, kind)
+        factors = lu.factor(J.at[:size, :size].add((damping * K).astype(J.dtype)))
+        flat = lu.substitute(factors, jnp.concatenate(c.single(r)))
+        turn = sizes.turn(flat[:size].astype(K.dtype))
+        step = Unknown(flat[:size].astype(K.dtype), flat[size:].astype(K.dtype))
+        moved = sizes.of_step(step)
+        cut = MOST_TURN / jnp.maximum(turn, MOST_TURN)
+        falling = (
+            lu.diagonal(factors) <= 0
+        )  # taut cables hold as many motions as their own rows have such pivots
+        definite = jnp.sum(falling[:size], axis=0) == jnp.sum(falling[size:], axis=0)
+        return Damped(
+            jax.tree.map(lambda x: cut * x, step), moved, r.q, sizes.of_imbalance(r), definite
+        )
+
+    def work(force: Array, step: Unknown) -> Array:
+        return jnp.sum(force * step.q, axis=0)
+
+    start = Unknown(
+        jnp.zeros((size, *arms), K.dtype), jnp.zeros((len(kind.cables), *arms), K.dtype)
+    )
+    floor = jnp.broadcast_to(rounding_of(problem), arms)
+    return damped_newton(evaluate, work, start, floor, 1 if problem.loads is None else LOAD_SHARES)
+
+
+def _residual(unknown: Unknown, basis: Basis, problem: Problem, kind: Kind) -> Array:
+    """Residual in a row."""
+    return jnp.concatenate(
+        imbalance(unknown, state_of(unknown, basis, problem, kind), basis, problem)
+    )
+
+
+def _jacobian(unknown: Unknown, basis: Basis, problem: Problem, kind: Kind) -> Array:
+    """Exact derivative of the residual by the coordinates and the tensions."""
+    size = unknown.q.size
+    return jax.jacfwd(lambda z: _residual(Unknown(z[:size], z[size:]), basis, problem, kind))(
+        jnp.concatenate(unknown)
+    )
+
+
+@partial(solve_prescribed.defjvp, symbolic_zeros=True)
+def _solve_prescribed_jvp(kind: Kind, primals: tuple, tangents: tuple) -> tuple[Solution, Solution]:
+    solution = solve_prescribed(*primals, kind)
+    sound = solution.balanced & solution.definite
+    unknown = Unknown(*(jnp.where(sound, x, 0.0) for x in solution.unknown))
+
+    change = change_of(
+        lambda basis, problem: _residual(unknown, basis, harmless(problem, sound), kind),
+        primals,
+        tangents,
+    )
+    J = _jacobian(unknown, primals[0], harmless(primals[1], sound), kind)
+    flat, size = -lu.solve(J, change), unknown.q.size
+    return solution, Solution(Unknown(flat[:size], flat[size:]), *no_derivative(*solution[1:]))

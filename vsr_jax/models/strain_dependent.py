@@ -1,0 +1,108 @@
+r"""The model of eq. 19-21: the basis $B_q = \Sigma^{-1} B_\tau(\xi)$ makes $q = \tau$, and the
+strain is solved at the nodes.
+
+Without loads every node is solved alone. With them the reaction to the loads is part of each node's
+balance, and the nodes are solved together (see `coupled`).
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from ..arm.scene import Scene, shared
+from ..mechanics.arm_balance import Unknown, problem_of, shares_at, state_of, with_tensions
+from ..mechanics.arm_solve import solve_arm
+from ..mechanics.balance import forces_where, newton_step, solve_balance, spread
+from ..mechanics.reaction import loading, react_at
+from ..numerics.component import Vector
+from ..numerics.magnus import ORDERS
+from ..validation import choice, count
+from .base import Nodes, Outcome, Status, SteppedModel, classify, rest_where_failed
+
+
+class StrainDependent(SteppedModel):
+    r"""Strain from the balance of each cross-section, $\xi = \Sigma^{-1} (B_\tau(\xi) \tau +
+    \Lambda) + \xi^*$ (eq. 21).
+
+    Without loads $\Lambda = 0$ and the strain is exact; the only error is that of the pose steps.
+    With loads the reaction is that of the steps' shape, and the pose at the ends of the steps keeps
+    their order.
+
+    **Arguments:**
+    - `steps`: steps along the arm, at least one on each of its smooth pieces, the others by their
+      lengths.
+    - `order`: order of the steps, 2, 4 (Zanna's, eq. 5) or 6, with one, two or three nodes each.
+    """
+
+    steps: int = eqx.field(static=True)
+    order: int = eqx.field(static=True)
+    balanced_everywhere = True
+
+    def __init__(self, steps: int = 32, order: int = 6):
+        self.steps = count("StrainDependent.steps", steps)
+        self.order = choice("StrainDependent.order", order, ORDERS)
+
+    def solve(self, scene: Scene, inputs: Float[Array, " inputs"]) -> Outcome:
+        if scene.coupled:
+            return self._solve_together(scene, inputs)
+        sections, forces = scene.sections(self.grid(scene).X), scene.forces(inputs)
+        tau = sections.carry(forces)
+        solution = solve_balance(sections, tau, None, scene.free)
+        status = classify(solution.xi, sections, tau, solution.balanced, solution.definite)
+        status = jnp.where(
+            status == Status.CONVERGED, _status_of_ends(scene, forces, solution.xi), status
+        )
+        state = Unknown(rest_where_failed(status, solution.xi, sections), (), ())
+        return Outcome(state, forces, status, solution.steps)
+
+    def _solve_together(self, scene: Scene, inputs: Float[Array, " inputs"]) -> Outcome:
+        problem, kind = problem_of(scene, inputs, self.grid(scene))
+        unknown, balanced, definite, steps = solve_arm(problem, kind)
+        tau = state_of(unknown, problem, kind).tau
+        status = classify(
+            unknown.xi, problem.sections, tau, balanced, definite, loaded=bool(scene.loads)
+        )
+        sound = status == Status.CONVERGED
+        forces = forces_where(sound, with_tensions(problem.forces, unknown.tension, kind))
+        xi = rest_where_failed(status, unknown.xi, problem.sections)
+        return Outcome(Unknown(xi, (), forces_where(sound, unknown.turning)), forces, status, steps)
+
+    def node_strain(self, scene: Scene, state: Unknown) -> Vector:
+        return state.xi
+
+    def nodes(self, scene: Scene, forces: Vector, state: Unknown) -> Nodes:
+        grid = self.grid(scene)
+        return Nodes(
+            grid,
+            state.xi,
+            scene.sections(grid.X),
+            shares_at(scene, state.xi, state.turning, grid, grid.X),
+        )
+
+    def coordinates(self, scene: Scene, forces: Vector, state: Unknown) -> Float[Array, " dofs"]:
+        return jnp.array(forces, state.xi[0].dtype)
+
+    def strain(
+        self, scene: Scene, forces: Vector, state: Unknown, X: Float[Array, " stations"]
+    ) -> Vector:
+        grid = self.grid(scene)
+        loads = loading(scene, grid)
+        reaction = None if loads is None else react_at(state.xi, grid, loads, X)
+        tau = shared(forces, shares_at(scene, state.xi, state.turning, grid, X))
+        start = tuple(jnp.interp(X, grid.X.T.reshape(-1), x.T.reshape(-1)) for x in state.xi)
+        return solve_balance(scene.sections(X), tau, reaction, scene.free, start).xi
+
+
+def _status_of_ends(scene: Scene, forces: Vector, xi: Vector) -> Array:
+    """Status of the arm's two ends, which no node sees: a tapering arm fails at its tip first. One
+    Newton step from the strain at the node beside is exact enough to tell."""
+    sections = scene.sections(jnp.stack([jnp.zeros_like(scene.rod.length), scene.rod.length]))
+    tau = sections.carry(forces)
+    beside = lax.stop_gradient(tuple(jnp.stack([x[0, 0], x[-1, -1]]) for x in xi))
+    _, step = newton_step(beside, sections, tau, None, scene.free)
+    definite = ~jnp.isnan(step[-1])
+    there = tuple(
+        jnp.where(definite, x - s, x) for x, s in zip(beside, spread(step, scene.free), strict=True)
+    )
+    return classify(there, sections, tau, jnp.ones_like(definite), definite)

@@ -1,0 +1,170 @@
+"""Vectors and small matrices whose components are separate arrays.
+
+A vector is a tuple of three arrays, a twist or a wrench a tuple of six (angular part first), a
+matrix a tuple of rows. All components share one shape: a scalar for a single cross-section,
+`(nodes,)` along an arm, with a batch axis in front under `jax.vmap` (the solver of loaded arms puts
+its batch last). Written this way the kernels are plain elementwise arithmetic, which XLA fuses into
+a few loops; small batched `dot_general`, `concatenate` and LAPACK calls, which it cannot fuse,
+never appear.
+"""
+
+import operator
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ..typing import cast
+
+Vector = tuple[Array, ...]
+Matrix = tuple[Vector, ...]
+Tree = TypeVar("Tree")
+
+
+def keep(tree: Tree, like: Array) -> Tree:
+    """The same values, computed once.
+
+    XLA on CPU computes sums and products anew in each of their uses, but never a division: values
+    with many uses are divided by a one that it cannot know. `like` is any array of their shape.
+    """
+    one = jnp.where(jnp.isnan(like), jnp.nan, 1.0)
+    return jax.tree.map(lambda x: x / one, tree)
+
+
+def single(tree: Tree) -> Tree:
+    """The same values in single precision; integers and truth values as they are."""
+    return cast(tree, jnp.float32)
+
+
+def split(array: Array) -> Vector:
+    """Components of the last axis of `array`."""
+    return tuple(array[..., i] for i in range(array.shape[-1]))
+
+
+def join(components: Vector) -> Array:
+    """Array whose last axis holds `components`; the inverse of `split`."""
+    return jnp.stack(jnp.broadcast_arrays(*components), axis=-1)
+
+
+def join_matrix(rows: Matrix) -> Array:
+    """Array whose last two axes hold the matrix `rows`."""
+    return jnp.stack([join(row) for row in rows], axis=-2)
+
+
+def symmetric(lower: Matrix) -> Matrix:
+    """The whole symmetric matrix from its lower triangle."""
+    size = len(lower)
+    return tuple(tuple(lower[max(i, j)][min(i, j)] for j in range(size)) for i in range(size))
+
+
+def add(a: Tree, b: Tree) -> Tree:
+    """Sum $a + b$ of two vectors or two matrices, component by component."""
+    return jax.tree.map(operator.add, a, b)
+
+
+def subtract(a: Tree, b: Tree) -> Tree:
+    """Difference $a - b$ of two vectors or two matrices, component by component."""
+    return jax.tree.map(operator.sub, a, b)
+
+
+def multiply(a: Vector, b: Vector) -> Vector:
+    """Component-wise product, as of a diagonal matrix and a vector."""
+    return tuple(x * y for x, y in zip(a, b, strict=True))
+
+
+def scale(s: Array | float, a: Tree) -> Tree:
+    """Product $s a$ of a scalar and a vector or a matrix."""
+    return jax.tree.map(lambda x: s * x, a)
+
+
+def dot(a: Vector, b: Vector) -> Array:
+    """Scalar product $a \\cdot b$."""
+    total = a[0] * b[0]
+    for x, y in zip(a[1:], b[1:], strict=True):
+        total = total + x * y
+    return total
+
+
+def norm(a: Vector) -> Array:
+    """Length $|a|$, with the derivative 0 at zero, where it has none."""
+    square = dot(a, a)
+    zero = square == 0
+    return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, square)))
+
+
+def cross(a: Vector, b: Vector) -> Vector:
+    """Vector product $a \\times b$ of two vectors of three components."""
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+def skew(v: Vector) -> Matrix:
+    r"""Matrix $\tilde v$ with $\tilde v w = v \times w$."""
+    zero = jnp.zeros_like(v[0])
+    return (zero, -v[2], v[1]), (v[2], zero, -v[0]), (-v[1], v[0], zero)
+
+
+def matvec(matrix: Matrix, vector: Vector) -> Vector:
+    """Product of a matrix and a vector."""
+    return tuple(dot(row, vector) for row in matrix)
+
+
+def transpose(matrix: Matrix) -> Matrix:
+    """Transposed matrix."""
+    return tuple(zip(*matrix, strict=True))
+
+
+def matmul(a: Matrix, b: Matrix) -> Matrix:
+    """Product of two matrices."""
+    columns = transpose(b)
+    return tuple(tuple(dot(row, column) for column in columns) for row in a)
+
+
+def adjugate(matrix: Matrix) -> tuple[Matrix, Array]:
+    """Adjugate and determinant of a matrix of three rows; their quotient is the inverse."""
+    first, second, third = matrix
+    cofactors = cross(second, third), cross(third, first), cross(first, second)
+    return transpose(cofactors), dot(first, cofactors[0])
+
+
+def cholesky(lower: Matrix) -> Matrix:
+    """Cholesky factor $L$, $A = L L^T$, of a symmetric matrix, unrolled.
+
+    Every entry of $L$ ends in a division or a square root, which XLA does not compute twice;
+    factors whose entries end in a product or a sum (an $L D L^T$) are recomputed in each of their
+    uses and cost twice as much (measured).
+
+    **Arguments:**
+    - `lower`: the lower triangle of $A$: row `i` holds `i + 1` components.
+
+    **Returns:** the lower triangle of $L$; its last row is NaN where $A$ is not positive definite.
+    """
+    factor: list[list[Array]] = []
+    for i, row in enumerate(lower):
+        entries: list[Array] = []
+        for j in range(i):
+            remainder = row[j]
+            for k in range(j):
+                remainder = remainder - entries[k] * factor[j][k]
+            entries.append(remainder / factor[j][j])
+        pivot = row[i]
+        for entry in entries:
+            pivot = pivot - entry * entry
+        entries.append(jnp.sqrt(pivot))
+        factor.append(entries)
+    return tuple(tuple(row) for row in factor)
+
+
+def cholesky_solve(factor: Matrix, right: Vector) -> Vector:
+    """Solution $x$ of $L L^T x = b$ with the factor of `cholesky`."""
+    x = list(right)
+    size = len(x)
+    for i in range(size):
+        for j in range(i):
+            x[i] = x[i] - factor[i][j] * x[j]
+        x[i] = x[i] / factor[i][i]
+    for i in reversed(range(size)):
+        for j in range(i + 1, size):
+            x[i] = x[i] - factor[j][i] * x[j]
+        x[i] = x[i] / factor[i][i]
+    return tuple(x)

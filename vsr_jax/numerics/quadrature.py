@@ -1,0 +1,154 @@
+"""Gauss-Legendre nodes on the pieces of an arm.
+
+An arm is cut at its breakpoints into pieces on which everything is smooth; each piece is cut into
+equal steps and each step carries the same Gauss nodes. Nodes and weights of the reference step are
+constants; the pieces may be traced.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from ..typing import Scalar
+from . import component as c
+from .component import Vector
+
+
+class Grid(NamedTuple):
+    """Steps along an arm with their Gauss nodes: `start` and `h` [m] of each step, `X` and `weight`
+    [m] of each node."""
+
+    start: Float[Array, " steps"]
+    h: Float[Array, " steps"]
+    X: Float[Array, "stages steps"]
+    weight: Float[Array, "stages steps"]
+
+
+def gauss_legendre(stages: int) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes and weights of Gauss-Legendre quadrature on [0, 1]; exact for polynomials of degree `2
+    stages - 1`."""
+    nodes, weights = np.polynomial.legendre.leggauss(stages)
+    return (nodes + 1) / 2, weights / 2
+
+
+def piece_edges(length: Scalar, breakpoints: tuple[Scalar, ...]) -> Float[Array, " edges"]:
+    """Ends of the pieces of [0, L], rising; breakpoints beyond the arm make empty pieces at its
+    ends."""
+    inner = [jnp.clip(point, 0, length) for point in breakpoints]
+    return jnp.sort(jnp.stack([jnp.zeros_like(length), *inner, length]))
+
+
+def make_grid(
+    edges: Float[Array, " edges"], steps: int | Array, stages: int, *, room: int | None = None
+) -> Grid:
+    """Grid of `steps` steps with `stages` nodes each.
+
+    Every piece between `edges` has at least one step, an empty piece too, so that a derivative sees
+    it open; the other steps are shared by the lengths of the pieces. Where `steps` is traced,
+    `room` says how many there may be: those that are not wanted are empty, at the end of the arm.
+    """
+    least = edges.size - 1
+    place = np.arange(max(int(steps) if room is None else room, least))
+    wanted = max(int(steps), least) if room is None else jnp.maximum(steps, least)
+    piece, count, at = (
+        (0, wanted, place) if least == 1 else _share(edges, wanted, jnp.asarray(place))
+    )
+    width = jnp.broadcast_to(jnp.diff(edges)[piece] / count, place.shape)
+    start = edges[:-1][piece] + at.astype(width.dtype) * width
+    if room is not None:
+        there = place < wanted
+        width, start = jnp.where(there, width, 0.0), jnp.where(there, start, edges[-1])
+    nodes, weights = (x.astype(width.dtype) for x in gauss_legendre(stages))
+    return Grid(start, width, start + nodes[:, None] * width, jnp.asarray(weights[:, None] * width))
+
+
+def _share(
+    edges: Float[Array, " edges"], steps: int | Array, place: Array
+) -> tuple[Array, Array, Array]:
+    """For each step its piece, the number of steps of that piece and its place among them; largest
+    remainders get more."""
+    lengths = jnp.diff(edges)
+    exact = (steps - lengths.size) * lengths / jnp.sum(lengths)
+    whole = jnp.floor(exact)
+    order = jnp.argsort(jnp.argsort(whole - exact))
+    spare = steps - lengths.size - jnp.sum(whole).astype(int)
+    count = 1 + whole.astype(int) + (order < spare).astype(int)
+    last = jnp.cumsum(count)
+    piece = jnp.minimum(jnp.searchsorted(last, place, side="right"), lengths.size - 1)
+    return piece, count[piece].astype(edges.dtype), place - (last - count)[piece]
+
+
+def interpolation(stages: int) -> np.ndarray:
+    r"""Coefficients $b_{pl}$ of the polynomial $\sum_p \sigma^p \sum_l b_{pl} f_l$ through values
+    $f_l$ at the Gauss nodes on [0, 1]."""
+    return np.linalg.inv(np.vander(gauss_legendre(stages)[0], increasing=True))
+
+
+def merging(stages: int) -> np.ndarray:
+    """Weights that carry values at the Gauss nodes of two equal steps, of the first and then of the
+    second, to those of one step of both by the polynomial through all of them; shape (stages, 2
+    stages)."""
+    nodes = gauss_legendre(stages)[0]
+    through = np.linalg.inv(np.vander(np.concatenate([nodes, nodes + 1]) / 2, increasing=True))
+    return np.vander(nodes, 2 * stages, increasing=True) @ through
+
+
+def weighted(weights: np.ndarray, values: Array) -> Array:
+    """Sum of the values at the nodes of a step, each with its weight."""
+    total = float(weights[0]) * values[0]
+    for i in range(1, len(weights)):
+        total = total + float(weights[i]) * values[i]
+    return total
+
+
+def beyond(density: Vector, grid: Grid) -> Vector:
+    r"""Integral from each node to the end of the arm, $\int_X^L q \, ds$: exact for q of degree
+    `stages - 1` in each step.
+
+    **Arguments:** `density`: component arrays $q$ at the nodes, shape (stages, steps) and that of
+    the arms side by side.
+    """
+    stages = grid.X.shape[0]
+    nodes, weights = gauss_legendre(stages)
+    powers = np.arange(1, stages + 1)
+    rest = weights - (nodes[:, None] ** powers / powers) @ interpolation(
+        stages
+    )  # of the integral over a step of length 1
+
+    def add(total: Vector, part: Vector) -> tuple[Vector, Vector]:
+        return c.add(total, part), total
+
+    parts = tuple(weighted(weights, grid.h * q) for q in density)
+    _, later = lax.scan(add, tuple(jnp.zeros_like(part[0]) for part in parts), parts, reverse=True)
+    return tuple(
+        jnp.stack([past + grid.h * weighted(row, q) for row in rest])
+        for past, q in zip(later, density, strict=True)
+    )
+
+
+def locate(grid: Grid, X: Array) -> tuple[Array, Array]:
+    """Step in which each abscissa lies and the fraction of the step before it."""
+    step = jnp.clip(jnp.searchsorted(grid.start, X, side="right") - 1, 0, grid.start.size - 1)
+    h = grid.h[step]
+    return step, jnp.where(h > 0, (X - grid.start[step]) / jnp.where(h > 0, h, 1.0), 0.0)
+
+
+def onto(X: Array, start: Array | float, end: Array | float, slack: Array) -> tuple[Array, Array]:
+    """Abscissas clipped to [start, end], and whether they lie there or beyond it by `slack` at
+    most. Those farther away become `start`, so that what is computed from them is finite; the
+    derivative of the others is 1."""
+    near = (X - start >= -slack) & (X - end <= slack)
+    x = jnp.where(near, X, start)
+    return x + lax.stop_gradient(jnp.clip(x, start, end) - x), near
+
+
+def within(density: Array, grid: Grid, step: Array, sigma: Array | float) -> Array:
+    r"""Integral from the start of a step to the fraction $\sigma$ of it of the polynomial through
+    the values at its nodes."""
+    stages = grid.X.shape[0]
+    weights, q = interpolation(stages), density[:, step]
+    parts = [sigma ** (p + 1) / (p + 1) * weighted(weights[p], q) for p in range(stages)]
+    return grid.h[step] * sum(parts[1:], parts[0])

@@ -1,0 +1,234 @@
+r"""The group of rigid motions SE(3) and its Lie algebra, angular part first (appendices A and B of
+the paper).
+
+A twist is $\xi = (k, u)$, a wrench $F = (M, N)$, a pose the matrix $g = \begin{pmatrix} R & r \\ 0
+& 1 \end{pmatrix}$. Every function takes one twist or one pose; batch with `jax.vmap`. The functions
+that end in `_components` are the same maps on tuples of component arrays (see `component`), for the
+kernels.
+"""
+
+import math
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..typing import Pose, Twist
+from . import component as c
+from .component import Matrix, Vector
+
+_TERMS = 14
+_SWITCH = 4.0  # of theta^2
+
+
+def exp_coefficients(x: Array) -> tuple[Array, Array, Array]:
+    r"""Coefficients $\sin\theta/\theta$, $(1-\cos\theta)/\theta^2$, $(\theta-\sin\theta)/\theta^3$
+    as entire functions of $x = \theta^2$.
+
+    A Taylor branch below $\theta = 2$ and the closed form above, each evaluated at a harmless
+    argument where the other one is taken, so that values and derivatives of any order are finite
+    and exact to rounding at every angle.
+    """
+    near = x < _SWITCH
+    below, above = jnp.where(near, x, 0.0), jnp.where(near, _SWITCH, x)
+    theta = jnp.sqrt(above)
+    sine, half = jnp.sin(theta), jnp.sin(0.5 * theta)
+    closed = (sine / theta, 2.0 * half * half / above, (theta - sine) / (above * theta))
+    series = (_stumpff(below, n) for n in (1, 2, 3))
+    a, b, c3 = (jnp.where(near, s, f) for s, f in zip(series, closed, strict=True))
+    return a, b, c3
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(1,))
+def _stumpff(x: Array, n: int) -> Array:
+    r"""Series of the Stumpff function $c_n(x) = \sum_j (-x)^j / (2 j + n)!$ for $0 \le x < 4$.
+
+    Its derivative is $c_n' = -\frac12 (c_{n+1} - n\,c_{n+2})$: two more series instead of a
+    differentiated one.
+    """
+    value = jnp.zeros_like(x)
+    for j in reversed(range(_TERMS)):
+        value = 1.0 / math.factorial(2 * j + n) - x * value
+    return value
+
+
+@_stumpff.defjvp
+def _stumpff_jvp(n: int, primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    (x,), (dx,) = primals, tangents
+    return _stumpff(x, n), -0.5 * (_stumpff(x, n + 1) - n * _stumpff(x, n + 2)) * dx
+
+
+def rotation_components(k: Vector) -> Matrix:
+    r"""Rotation $\exp \tilde k$ of a tuple of three component arrays, as rows of components."""
+    a, b, _ = exp_coefficients(c.dot(k, k))
+    return _rotation(k, *c.keep((a, b), k[0]))
+
+
+def _rotation(k: Vector, a: Array, b: Array) -> Matrix:
+    kx, ky, kz = k
+    xx, yy, zz = b * kx * kx, b * ky * ky, b * kz * kz
+    xy, xz, yz = b * kx * ky, b * kx * kz, b * ky * kz
+    ax, ay, az = a * kx, a * ky, a * kz
+    return (
+        (1.0 - yy - zz, xy - az, xz + ay),
+        (xy + az, 1.0 - xx - zz, yz - ax),
+        (xz - ay, yz + ax, 1.0 - xx - yy),
+    )
+
+
+def exp_components(omega: Vector) -> tuple[Matrix, Vector]:
+    """`exp` on a tuple of six component arrays: the rotation as rows of components and the
+    translation."""
+    k, u = omega[:3], omega[3:]
+    a, b, c3 = exp_coefficients(c.dot(k, k))
+    ku = c.cross(k, u)
+    kku = c.cross(k, ku)
+    translation = tuple(p + b * q + c3 * s for p, q, s in zip(u, ku, kku, strict=True))
+    return _rotation(k, a, b), translation
+
+
+def skew(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    r"""Matrix $\tilde v$ with $\tilde v w = v \times w$."""
+    return c.join_matrix(c.skew(c.split(v)))
+
+
+def hat(xi: Twist) -> Pose:
+    r"""Matrix of a twist (eq. 2).
+
+    $\hat\xi = \begin{pmatrix} \tilde k & u \\ 0 & 0 \end{pmatrix}$, so that a pose obeys $g' = g
+    \hat\xi$.
+
+    **Arguments:** `xi`: twist $(k, u)$, shape (6,).
+
+    **Returns:** the matrix $\hat\xi$, shape (4, 4).
+    """
+    top = jnp.concatenate([skew(xi[:3]), xi[3:, None]], axis=1)
+    return jnp.concatenate([top, jnp.zeros_like(top[:1])])
+
+
+def vee(matrix: Pose) -> Twist:
+    r"""Twist of a matrix of se(3), the inverse of `hat`: the skew part of $\tilde k$ is taken.
+
+    **Arguments:** `matrix`: $\hat\xi$, shape (4, 4).
+
+    **Returns:** $\xi = (k, u)$, shape (6,).
+    """
+    m = matrix
+    angular = 0.5 * jnp.stack([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]])
+    return jnp.concatenate([angular, m[:3, 3]])
+
+
+def pose(rotation: Matrix, position: Vector) -> Float[Array, "*batch 4 4"]:
+    """Matrix $g$ of shape (..., 4, 4) from the components of $R$ and $r$."""
+    zero = jnp.zeros_like(position[0])
+    rows = [(*row, x) for row, x in zip(rotation, position, strict=True)]
+    return c.join_matrix((*rows, (zero, zero, zero, zero + 1.0)))
+
+
+def exp(omega: Twist) -> Pose:
+    r"""Exponential map (eq. 24).
+
+    $\exp\hat\Omega = I + \hat\Omega + \frac{1-\cos\theta}{\theta^2}\hat\Omega^2 +
+    \frac{\theta-\sin\theta}{\theta^3}\hat\Omega^3$, with $\theta$ the norm of the angular part.
+
+    **Arguments:** `omega`: twist $\Omega$, shape (6,).
+
+    **Returns:** the pose, shape (4, 4). Derivatives are exact at $\theta = 0$ too.
+    """
+    return pose(*exp_components(c.split(omega)))
+
+
+def inverse(g: Pose) -> Pose:
+    r"""Inverse pose $g^{-1} = (R^T, -R^T r)$, shape (4, 4)."""
+    rotation = g[:3, :3].T
+    top = jnp.concatenate([rotation, -(rotation @ g[:3, 3])[:, None]], axis=1)
+    return jnp.concatenate([top, g[3:]])
+
+
+def rotation_vector(rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    r"""Axis times angle [rad] of a rotation, $\theta$ with $R = \exp \tilde\theta$, $|\theta| \le
+    \pi$.
+
+    Smooth but at half a turn, where both signs are right. The axis is that of the skew part,
+    $\sin\theta\, n$; for large angles that of the symmetric part, $(1 - \cos\theta)\, n n^T$.
+    """
+    axis = 0.5 * jnp.stack(
+        [
+            rotation[2, 1] - rotation[1, 2],
+            rotation[0, 2] - rotation[2, 0],
+            rotation[1, 0] - rotation[0, 1],
+        ]
+    )
+    cosine = 0.5 * (jnp.trace(rotation) - 1)
+    square = jnp.dot(axis, axis)
+    near, large = (square < 1e-8) & (cosine > 0), cosine < -0.5
+    sine = jnp.sqrt(jnp.where(near | large, 1.0, square))
+    factor = jnp.where(
+        near, 1 + square / 6, jnp.arctan2(sine, jnp.where(near | large, 1.0, cosine)) / sine
+    )
+    outer = 0.5 * (rotation + rotation.T) - cosine * jnp.eye(3, dtype=rotation.dtype)
+    outer = jnp.where(large, outer, jnp.eye(3, dtype=rotation.dtype))
+    column = outer[:, jnp.argmax(jnp.diagonal(outer))]
+    n = column / jnp.sqrt(jnp.dot(column, column))
+    turned = jnp.arctan2(jnp.dot(n, axis), jnp.where(large, cosine, -1.0)) * n
+    return jnp.where(large, turned, factor * axis)
+
+
+def _blocks(a: Array, b: Array, c_: Array, d: Array) -> Float[Array, "6 6"]:
+    return jnp.concatenate([jnp.concatenate([a, b], axis=1), jnp.concatenate([c_, d], axis=1)])
+
+
+def adjoint(g: Pose) -> Float[Array, "6 6"]:
+    r"""Adjoint map of a pose, which carries twists from the body to the world.
+
+    $\mathrm{Ad}_g = \begin{pmatrix} R & 0 \\ \tilde r R & R \end{pmatrix}$, shape (6, 6).
+    """
+    rotation = g[:3, :3]
+    return _blocks(rotation, jnp.zeros_like(rotation), skew(g[:3, 3]) @ rotation, rotation)
+
+
+def coadjoint(g: Pose) -> Float[Array, "6 6"]:
+    r"""Co-adjoint map of a pose, which carries wrenches from the body to the world.
+
+    $\mathrm{Ad}^*_g = \begin{pmatrix} R & \tilde r R \\ 0 & R \end{pmatrix} =
+    \mathrm{Ad}_{g^{-1}}^T$, shape (6, 6).
+    """
+    rotation = g[:3, :3]
+    return _blocks(rotation, skew(g[:3, 3]) @ rotation, jnp.zeros_like(rotation), rotation)
+
+
+def ad(xi: Twist) -> Float[Array, "6 6"]:
+    r"""Adjoint map of a twist, the Lie bracket $\mathrm{ad}_\xi \eta = [\xi, \eta]$.
+
+    $\mathrm{ad}_\xi = \begin{pmatrix} \tilde k & 0 \\ \tilde u & \tilde k \end{pmatrix}$, shape (6,
+    6).
+    """
+    k, u = skew(xi[:3]), skew(xi[3:])
+    return _blocks(k, jnp.zeros_like(k), u, k)
+
+
+def coad(xi: Twist) -> Float[Array, "6 6"]:
+    r"""Co-adjoint map of a twist, so that $(\mathrm{Ad}^*_g)' = \mathrm{Ad}^*_g \mathrm{ad}^*_\xi$
+    along an arm.
+
+    $\mathrm{ad}^*_\xi = \begin{pmatrix} \tilde k & \tilde u \\ 0 & \tilde k \end{pmatrix} =
+    -\mathrm{ad}_\xi^T$, shape (6, 6).
+    """
+    k, u = skew(xi[:3]), skew(xi[3:])
+    return _blocks(k, u, jnp.zeros_like(k), k)
+
+
+def bracket_components(a: Vector, b: Vector) -> Vector:
+    r"""Lie bracket $[a, b] = \mathrm{ad}_a b$ on tuples of six component arrays."""
+    angular = c.cross(a[:3], b[:3])
+    linear = c.add(c.cross(a[:3], b[3:]), c.cross(a[3:], b[:3]))
+    return (*angular, *linear)
+
+
+def compose_components(
+    g: tuple[Matrix, Vector], increment: tuple[Matrix, Vector]
+) -> tuple[Matrix, Vector]:
+    """Product of two poses given by the components of their rotation and translation."""
+    rotation, position = g
+    return c.matmul(rotation, increment[0]), c.add(position, c.matvec(rotation, increment[1]))

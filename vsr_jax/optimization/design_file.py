@@ -1,0 +1,148 @@
+"""Problems of design as TOML files.
+
+title = "A helix that reaches out" scene = "helix.toml" # beside this file; or a table [scene], as
+in a scene file inputs = [[5.0]] # one row a set of inputs steps = 400 # and other numbers that
+`design` takes: starts, learning_rate, candidates, seed, enough, patience
+
+[free]
+"actuators[0].routing.radius" = [0.002, 0.009]
+inputs = [0.0, 12.0]
+
+[uncertain]
+"rod.material.young" = 0.1
+
+[[objectives]]
+type = "TipError"
+weight = 1.0
+targets = [[0.5, 0.1, 0.2]]
+
+[[constraints]]
+type = "Inside"
+wall = 0.001
+"""
+
+import tomllib
+from os import PathLike
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ..arm.scene import Scene
+from ..files.scene_file import at, check_keys, kind_of, load, parse_table
+from . import constraint, objective
+from .constraint import Constraint
+from .objective import Objective
+
+_OBJECTIVES = {
+    kind.__name__: kind
+    for kind in (
+        objective.TipError,
+        objective.CurveError,
+        objective.Workspace,
+        objective.TipCompliance,
+        objective.Tension,
+    )
+}
+_CONSTRAINTS = {
+    kind.__name__: kind
+    for kind in (
+        constraint.Inside,
+        constraint.MinSpacing,
+        constraint.MaxTension,
+        constraint.BendRadius,
+        constraint.StabilityMargin,
+    )
+}
+_SETTINGS = ("starts", "steps", "learning_rate", "candidates", "seed", "enough", "patience")
+_KEYS = ("title", "scene", "inputs", "free", "uncertain", "objectives", "constraints")
+
+
+class DesignFile(NamedTuple):
+    """What a file asks for: the `title`, and the arguments of `design`, those by name in
+    `settings`."""
+
+    title: str
+    scene: Scene
+    free: dict[str, Any]
+    objective: Objective
+    inputs: Any
+    settings: dict[str, Any]
+
+
+def load_design(path: str | PathLike[str]) -> DesignFile:
+    """Reads a problem of design from a TOML file.
+
+    **Raises:** `ValueError` of one line that begins with the file's name, as `load`.
+    """
+    try:
+        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"{path}: {error.strerror}") from None
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    try:
+        return _parsed(table, Path(path).parent)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def _parsed(table: dict[str, Any], folder: Path) -> DesignFile:
+    known = (*_KEYS, *_SETTINGS)
+    unknown = [key for key in table if key not in known]
+    if unknown:
+        raise ValueError(f"unknown key {unknown[0]!r}, known are {', '.join(sorted(known))}")
+    missing = [key for key in ("scene", "free", "objectives") if key not in table]
+    if missing:
+        raise ValueError(f"missing key {missing[0]!r}, known are {', '.join(sorted(known))}")
+    kept = (
+        load(folder / table["scene"])
+        if isinstance(table["scene"], str)
+        else parse_table(table["scene"], "scene")
+    )
+    inputs = table.get("inputs", None if kept.inputs is None else [kept.inputs.tolist()])
+    if inputs is None:
+        raise ValueError("missing key 'inputs', and the scene has none")
+    settings = {name: table[name] for name in _SETTINGS if name in table}
+    settings["constraints"] = [
+        _constraint(one, f"constraints[{i}]") for i, one in enumerate(_tables(table, "constraints"))
+    ]
+    settings["uncertain"] = table.get("uncertain", {})
+    return DesignFile(
+        str(table.get("title", "")),
+        kept.scene,
+        table["free"],
+        _objective(_tables(table, "objectives")),
+        inputs,
+        settings,
+    )
+
+
+def _tables(table: dict[str, Any], key: str) -> list[dict[str, Any]]:
+    value = table.get(key, [])
+    if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
+        raise ValueError(f"{key}: got {value!r}, need tables, each under [[{key}]]")
+    return value
+
+
+def _objective(tables: list[dict[str, Any]]) -> Objective:
+    if not tables:
+        raise ValueError("objectives: got none, need at least one table under [[objectives]]")
+    parts = []
+    for i, table in enumerate(tables):
+        rest = {key: value for key, value in table.items() if key != "weight"}
+        part = _made(rest, f"objectives[{i}]", _OBJECTIVES)
+        parts.append(table["weight"] * part if "weight" in table else part)
+    return parts[0] if len(parts) == 1 else objective.Sum(tuple(parts))
+
+
+def _constraint(table: dict[str, Any], path: str) -> Constraint:
+    return _made(table, path, _CONSTRAINTS)
+
+
+def _made(table: dict[str, Any], path: str, group: dict[str, type]) -> Any:
+    kind = kind_of(table, path, group)
+    arguments = {key: value for key, value in table.items() if key != "type"}
+    check_keys(kind, arguments, path)
+    try:
+        return kind(**arguments)
+    except (ValueError, TypeError) as error:
+        raise ValueError(at(path, str(error))) from None

@@ -1,0 +1,176 @@
+r"""A problem of design: what is free and between which bounds, what is to be least, what is to be
+kept, what is uncertain."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..arm.scene import Scene
+from ..arm.scene_numbers import matching, parameters, replaced
+from ..models.base import Model
+from ..models.strain_dependent import StrainDependent
+from ..solution.solver import outcome_of
+from ..typing import Scalar, cast
+from ..validation import instance, numbers, positive
+from .constraint import Constraint, Inside
+from .descent import Numbers, Problem
+from .objective import Arms, Measure, Objective
+
+INPUTS = "inputs"
+"""Name of the inputs among the free numbers."""
+
+_DRAWS = 8
+
+
+class Terms(eqx.Module):
+    """Objective and margins as a function of the free numbers, those named `inputs` among them.
+
+    `factors`: for each number that is not certain what it may be multiplied by, shape (draws,); the
+    objective is their mean and the margins are kept by all.
+    """
+
+    scene: Scene
+    inputs: Float[Array, "sets inputs"]
+    model: Model
+    objective: Objective
+    constraints: tuple[Constraint, ...]
+    factors: dict[str, Array]
+
+    def __call__(self, free: Numbers) -> tuple[Scalar, list[Array]]:
+        def one(factors: dict[str, Array]) -> tuple[Scalar, list[Array]]:
+            arms = self.arms(free, factors)
+            return self.objective(arms), [constraint(arms) for constraint in self.constraints]
+
+        if not self.factors:
+            return one({})
+        objective, margins = jax.vmap(one)(self.factors)
+        return jnp.mean(objective), margins
+
+    def placed(self, free: Numbers) -> tuple[Scene, Array]:
+        """The scene and the inputs with the free numbers in place."""
+        return replaced(
+            self.scene, {name: x for name, x in free.items() if name != "inputs"}
+        ), free.get("inputs", self.inputs)
+
+    def arms(self, free: Numbers, factors: Mapping[str, Array]) -> Arms:
+        """The scene solved under every set of inputs."""
+        scene, inputs = self.placed(free)
+        known = parameters(scene) if factors else {}
+        scene = replaced(
+            scene, {name: known[name].value * factor for name, factor in factors.items()}
+        )
+        return Arms(
+            scene, inputs, self.model, jax.vmap(lambda u: outcome_of(scene, u, self.model))(inputs)
+        )
+
+
+def posed(
+    scene: Scene,
+    free: Mapping[str, Any],
+    objective: Objective | Callable[[Arms], Scalar],
+    inputs: Any,
+    constraints: Sequence[Constraint],
+    uncertain: Mapping[str, float],
+    model: Model | None,
+) -> tuple[Problem, Terms, Numbers]:
+    """The problem, its terms, and the free numbers as the scene has them; arguments and errors as
+    for `design`."""
+    instance("scene", scene, Scene, "a Scene")
+    sets = _sets(scene, inputs)
+    wanted = objective if isinstance(objective, Objective) else Measure(_function(objective))
+    kept = tuple(
+        instance(f"constraints[{i}]", one, Constraint, "a Constraint")
+        for i, one in enumerate(constraints)
+    )
+    kept = kept if any(isinstance(one, Inside) for one in kept) else (Inside(), *kept)
+    known = {name: parameter.value for name, parameter in parameters(scene).items()} | {
+        INPUTS: sets
+    }
+    low, high = _bounds(free, known)
+    wanted.check(sets.shape[0], high.get("rod.length", scene.rod.length))
+    if INPUTS in low:
+        for end in (low[INPUTS], high[INPUTS]):
+            for row in np.asarray(end):
+                scene.check_inputs(row)
+    chosen = (
+        StrainDependent()
+        if model is None
+        else instance("model", model, Model, "StrainDependent(), Prescribed(basis) or Continuum()")
+    )
+    terms = Terms(scene, sets, chosen, wanted, kept, _factors(uncertain, known))
+    low, high, terms, given = cast(
+        (low, high, terms, {name: known[name] for name in low}), sets.dtype
+    )
+    return Problem(low, high, terms), terms, given
+
+
+def _sets(scene: Scene, inputs: Any) -> Float[Array, "sets inputs"]:
+    sets = numbers("inputs", inputs, None, finite=False)
+    if sets.ndim != 2 or not len(sets):
+        raise ValueError(
+            f"inputs: got shape {sets.shape}, need (sets, {len(scene.actuators)}), a row for each "
+            f"set of inputs"
+        )
+    for row in sets:
+        scene.check_inputs(row)
+    return sets
+
+
+def _function(objective: Any) -> Callable[[Arms], Any]:
+    if not callable(objective):
+        raise ValueError(
+            f"objective: got {objective!r}, need an Objective such as TipError or CurveError, or "
+            f"a function of Arms"
+        )
+    return objective
+
+
+def _bounds(free: Mapping[str, Any], known: Mapping[str, Array]) -> tuple[Numbers, Numbers]:
+    """Least and greatest of every free number by its name."""
+    low, high = {}, {}
+    for pattern, pair in free.items():
+        for name in matching(pattern, known):
+            low[name], high[name] = _ends(f"free[{pattern!r}]", pair, name, known[name])
+    if not any(np.any(np.asarray(high[name]) > np.asarray(low[name])) for name in low):
+        raise ValueError(
+            f"free: got {dict(free)!r}, need at least one number with room between its bounds"
+        )
+    return low, high
+
+
+def _ends(said: str, pair: Any, name: str, value: Array) -> tuple[Array, Array]:
+    """The bounds of a number of that value; infinite for a phase that may turn."""
+    if pair is None and name.endswith(".phase"):
+        return jnp.full_like(value, -jnp.inf), jnp.full_like(value, jnp.inf)
+    if not isinstance(pair, tuple | list) or len(pair) != 2:
+        raise ValueError(
+            f"{said}: got {pair!r}, need a pair, the least and the greatest value (or None for a "
+            f"phase)"
+        )
+    ends = [numbers(f"{said}[{i}]", end, None) for i, end in enumerate(pair)]
+    for i, end in enumerate(ends):
+        if end.shape not in ((), value.shape):
+            raise ValueError(
+                f"{said}[{i}]: got shape {end.shape}, need one number or {value.shape}, as {name}"
+            )
+    if np.any(np.asarray(ends[0]) > np.asarray(ends[1])):
+        raise ValueError(f"{said}: got {pair!r}, need the least value first")
+    low, high = (jnp.broadcast_to(end, value.shape) for end in ends)
+    return low, high
+
+
+def _factors(uncertain: Mapping[str, float], known: Mapping[str, Array]) -> dict[str, Array]:
+    """What uncertain numbers may be multiplied by: exp(s n), n normal, each draw with its
+    opposite."""
+    factors, generator = {}, np.random.default_rng(0)
+    for pattern, deviation in uncertain.items():
+        size = positive(f"uncertain[{pattern!r}]", deviation)
+        for name in matching(pattern, known):
+            half = generator.standard_normal(_DRAWS // 2)
+            factors[name] = jnp.exp(size * jnp.asarray([*half, *-half], known[name].dtype))
+    return factors

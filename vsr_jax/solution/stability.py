@@ -1,0 +1,291 @@
+r"""Eigenvalues of the tangent stiffness, scaled so that an arm without forces has 1: the least is
+the stability margin.
+
+Where loads tie the nodes to each other, a change $\delta\xi = (\kappa, \upsilon)$ of the strain
+turns the sections in the world frame by $\theta = \int R \kappa \, dX$. With $(m, n)$ the wrench
+there and $p'$ the axis, all in the world frame, the residual changes by
+
+$$\delta r = H \, \delta\xi - (R^T (\delta m - \theta \times m),
+R^T (\delta n - \theta \times n)), \quad
+-\delta n' = \theta \times f, \quad -\delta m' = (\theta \times p' + R \upsilon) \times n + p'
+\times \delta n + \theta \times c,$$
+
+where c and f are the densities that follow the arm. The product with the tangent is thus a few sums
+along the arm. It is the exact derivative of the discrete residual: $\theta$ is that of the Magnus
+steps.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..arm.scene import CrossSections, Scene
+from ..mechanics.balance import (
+    chosen,
+    chosen_rows,
+    residual,
+    spread,
+    tangent,
+    thread_direction,
+    thread_wrench,
+)
+from ..mechanics.reaction import Loading, loading, partial_rotation, react, turned
+from ..models.base import Nodes
+from ..numerics import component as c
+from ..numerics.component import Matrix, Vector
+from ..numerics.implicit import change_of
+from ..numerics.lanczos import Operator, extreme_pairs
+from ..numerics.magnus import step_components
+from ..numerics.quadrature import Grid, beyond, gauss_legendre
+from ..numerics.se3 import exp_coefficients, rotation_components
+
+
+def extreme(scene: Scene, forces: Vector, nodes: Nodes, *, greatest: bool = False) -> Array:
+    r"""Least eigenvalue of $\Sigma^{-1/2} H \Sigma^{-1/2}$, or the greatest: of each node alone, or
+    with loads of all together.
+
+    Coupled, it is that of the symmetric part of the whole tangent among the changes of strain that
+    the taut cables allow; NaN where it is not found. Without loads cables do not count: they are
+    finitely many, and no number of them stiffens every section.
+    """
+    if scene.loads:
+        return _extreme(arm_of(scene, forces, nodes), -1 if greatest else 0)
+    lower = chosen_rows(tangent(nodes.xi, nodes.sections, nodes.tau(forces)), scene.free)
+    root = jnp.sqrt(c.join(chosen(nodes.sections.stiffness, scene.free)))
+    values = jnp.linalg.eigvalsh(
+        c.join_matrix(c.symmetric(lower)) / (root[..., :, None] * root[..., None, :])
+    )
+    return jnp.max(values) if greatest else jnp.min(values)
+
+
+class Arm(eqx.Module):
+    """What the tangent of all nodes together is made of: strain, cross-sections, thread forces and
+    loads at the nodes of a grid.
+
+    `units` scales changes of the free strains, $\\Sigma^{-1/2} W^{-1/2}$ with W the weights of the
+    nodes; `taut`: see `ScaledTangent`.
+    """
+
+    xi: Vector
+    sections: CrossSections
+    tau: Vector
+    loads: Loading
+    grid: Grid
+    units: Float[Array, "strains stages steps"]
+    taut: tuple[Array, ...]
+    free: tuple[int, ...] = eqx.field(static=True)
+
+    def tangent(self) -> "ScaledTangent":
+        """The operator whose eigenvalues are wanted."""
+        lower = tangent(self.xi, self.sections, self.tau)
+        return ScaledTangent(
+            lower,
+            self.units,
+            self.grid.weight,
+            _along(self.xi, self.grid, self.loads),
+            self.taut,
+            self.free,
+        )
+
+    def form(self, v: Array) -> Array:
+        """$v^T S v$ with S the scaled tangent, by differentiation of the residual: less to compile
+        where it is differentiated itself."""
+
+        def imbalance(xi: Vector) -> Vector:
+            return residual(xi, self.sections, self.tau, react(xi, self.grid, self.loads).wrench)
+
+        x = spread(tuple(self.units * _projected(v, self.units, self.taut)), self.free)
+        return jnp.sum(self.grid.weight * c.dot(x, jax.jvp(imbalance, (self.xi,), (x,))[1]))
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(1,))
+def _extreme(arm: Arm, place: int) -> Array:
+    return extreme_pairs(arm.tangent()).values[place]
+
+
+@partial(_extreme.defjvp, symbolic_zeros=True)
+def _extreme_jvp(place: int, primals: tuple[Arm], tangents: tuple[Arm]) -> tuple[Array, Array]:
+    values, vectors = extreme_pairs(primals[0].tangent())
+    return values[place], change_of(lambda arm: arm.form(vectors[place]), primals, tangents)
+
+
+class _Following(NamedTuple):
+    """A wrench (M, F) at the end of a step, in the world frame: 1 for that end among the starts of
+    steps and the tip, 1 at the nodes before it."""
+
+    end: Float[Array, " steps_and_one"]
+    before: Float[Array, "stages steps"]
+    wrench: Vector
+
+
+class _Along(NamedTuple):
+    r"""What the loads make of a change of strain, in the world frame: `rotation` R, `wrench` (m, n)
+    and `axis` p' at the nodes; the density (c, f) and the point wrenches that follow the arm; the
+    turn of each node from the start of its step, and of each step, by the angular strains
+    (component and stage) at the step's nodes; the integral from each node to the tip by the values
+    at all."""
+
+    rotation: Matrix
+    wrench: Vector
+    axis: Vector
+    follower: Vector | None
+    points: tuple[_Following, ...]
+    turn: tuple[Float[Array, "strains stages steps"], ...]
+    step_turn: tuple[Float[Array, "strains steps"], ...]
+    beyond: Float[Array, "nodes nodes"]
+
+
+class ScaledTangent(Operator):
+    r"""Symmetric part of $W^{1/2} \Sigma^{-1/2} (\partial r / \partial \xi) \Sigma^{-1/2} W^{-1/2}$
+    with W the weights of the nodes, on arrays of the shape (free strains, stages, steps).
+
+    Not allowed are changes of strain at nodes without weight, of pieces of the arm without length,
+    and those that shorten the path of a taut cable (`taut`: orthonormal, zero for slack ones).
+    """
+
+    lower: Matrix
+    units: Float[Array, "strains stages steps"]
+    weight: Float[Array, "stages steps"]
+    along: _Along
+    taut: tuple[Array, ...]
+    free: tuple[int, ...] = eqx.field(static=True)
+
+    @property
+    def like(self) -> Array:
+        return self.units
+
+    def allowed(self, v: Array) -> Array:
+        return _projected(v, self.units, self.taut)
+
+    def times(self, v: Array) -> Array:
+        back = jax.linear_transpose(self._times, self.like)
+        v = self.allowed(v)
+        return self.allowed(0.5 * (self._times(v) + back(v)[0]))
+
+    def _times(self, v: Array) -> Array:
+        x = spread(tuple(self.units * v), self.free)
+        r = c.subtract(c.matvec(c.symmetric(self.lower), x), _reaction_change(x, self.along))
+        return self.weight * self.units * jnp.stack(chosen(r, self.free))
+
+
+def _projected(v: Array, units: Array, taut: tuple[Array, ...]) -> Array:
+    v = jnp.where(units > 0, v, 0.0)
+    for unit in taut:
+        v = v - jnp.sum(unit * v) * unit
+    return v
+
+
+def arm_of(scene: Scene, forces: Vector, nodes: Nodes) -> Arm:
+    """The arm at a solution, or at any other strain."""
+    sections, grid, free = nodes.sections, nodes.grid, scene.free
+    loads = loading(scene, grid)
+    assert loads is not None
+    xi = tuple(jnp.broadcast_to(x, grid.X.shape) for x in nodes.xi)
+    stiffness = jnp.stack(
+        [jnp.broadcast_to(s, grid.X.shape) for s in chosen(sections.stiffness, free)]
+    )
+    there = grid.weight > 0
+    units = jnp.where(there, 1 / jnp.sqrt(jnp.where(there, grid.weight, 1.0) * stiffness), 0.0)
+    taut: list[Array] = []
+    for place in scene.length_driven:
+        path, reach = sections.paths[place], sections.reach[place]
+        unit = (
+            grid.weight
+            * units
+            * jnp.stack(chosen(thread_wrench(thread_direction(xi, path)[0], path), free))
+        )
+        unit = unit if reach is None else reach * unit
+        for other in taut:
+            unit = unit - jnp.sum(other * unit) * other
+        size = jnp.sum(unit**2)
+        holds = (forces[place] < 0) & (size > 0)
+        taut.append(jnp.where(holds, unit / jnp.sqrt(jnp.where(holds, size, 1.0)), 0.0))
+    return Arm(xi, sections, nodes.tau(forces), loads, grid, units, tuple(taut), free)
+
+
+def _along(xi: Vector, grid: Grid, loads: Loading) -> _Along:
+    """The reaction and all that its change is made of."""
+    steps, size = grid.h.size, grid.X.size
+    now = react(xi, grid, loads)
+    unit = jnp.eye(size, dtype=grid.h.dtype).reshape(*grid.X.shape, size)
+    (integral,) = beyond((unit,), grid._replace(h=grid.h[:, None]))
+    points = tuple(
+        _Following((jnp.arange(steps + 1) == point.step).astype(grid.h.dtype), point.before, wrench)
+        for point, wrench in zip(loads.follower_points, now.points, strict=True)
+    )
+    turns = _turns(xi[:3], grid, now.starts, now.rotation)
+    return _Along(
+        now.rotation,
+        now.world,
+        now.axis,
+        now.follower,
+        points,
+        *turns,
+        integral.reshape(size, size),
+    )
+
+
+def _turns(k: Vector, grid: Grid, starts: Matrix, rotation: Matrix) -> tuple[Vector, Vector]:
+    """Derivatives of the turn of the nodes from the start of their step, and of the steps, by each
+    angular strain in the step."""
+    stages = grid.X.shape[0]
+    share = jnp.asarray(gauss_legendre(stages)[0], grid.h.dtype)[:, None]
+
+    def vectors(*k: Array) -> tuple[Vector, Vector]:
+        zero = jnp.zeros_like(k[0][0])
+        steps = step_components(
+            tuple((*(x[i] for x in k), zero, zero, zero) for i in range(stages)), grid.h
+        )[:3]
+        return partial_rotation(k, grid.h, share), steps
+
+    now = vectors(*k)
+    ends = c.matmul(starts, rotation_components(now[1]))
+
+    def by_strain(unit: Array) -> tuple[Vector, Vector]:
+        change = tuple(jnp.broadcast_to(x[:, None], k[0].shape) for x in unit)
+        _, (nodes, steps) = jax.jvp(vectors, k, change)
+        return c.matvec(rotation, _turn(now[0], nodes)), c.matvec(ends, _turn(now[1], steps))
+
+    return jax.vmap(by_strain)(jnp.eye(3 * stages, dtype=grid.h.dtype).reshape(-1, 3, stages))
+
+
+def _turn(omega: Vector, change: Vector) -> Vector:
+    r"""Turn $\epsilon$ in the body frame by a change of a rotation vector, $\tilde\epsilon = R^T
+    \delta R$ for $R = \exp \tilde\omega$."""
+    _, b, c3 = exp_coefficients(c.dot(omega, omega))
+    across = c.cross(omega, change)
+    return c.add(change, c.subtract(c.scale(c3, c.cross(omega, across)), c.scale(b, across)))
+
+
+def _reaction_change(x: Vector, along: _Along) -> Vector:
+    r"""Change of the reaction $\Lambda$ by a change of the strain, to first order."""
+    shape, steps = x[0].shape, x[0].shape[1]
+    kappa = jnp.stack(x[:3]).reshape(-1, steps)
+    before = jnp.asarray(np.triu(np.ones((steps, steps + 1)), 1), kappa.dtype)
+    starts = tuple(jnp.sum(rate * kappa, axis=0) @ before for rate in along.step_turn)
+    theta = tuple(
+        s[:-1] + jnp.sum(rate * kappa[:, None], axis=0)
+        for s, rate in zip(starts, along.turn, strict=True)
+    )
+
+    def integral(density: Vector) -> Vector:
+        return tuple((along.beyond @ q.reshape(-1)).reshape(shape) for q in density)
+
+    (m, n), p = (along.wrench[:3], along.wrench[3:]), along.axis
+    dm, dn = c.cross(m, theta), c.cross(n, theta)
+    for point in along.points:
+        turn = tuple(jnp.sum(point.end * s) for s in starts)
+        moment, force = c.cross(turn, point.wrench[:3]), c.cross(turn, point.wrench[3:])
+        dm, dn = c.add(dm, c.scale(point.before, moment)), c.add(dn, c.scale(point.before, force))
+    density = c.cross(c.add(c.cross(theta, p), c.matvec(along.rotation, x[3:])), n)
+    if along.follower is not None:
+        dn = c.add(dn, integral(c.cross(theta, along.follower[3:])))
+        density = c.add(density, c.cross(theta, along.follower[:3]))
+    if along.follower is not None or along.points:
+        density = c.add(density, c.cross(p, c.subtract(dn, c.cross(n, theta))))
+    return turned(c.transpose(along.rotation), (*c.add(dm, integral(density)), *dn))

@@ -1,0 +1,128 @@
+"""What is drawn onto an arm in space: frames of its sections, arrows of its loads, ellipsoids of
+its tip. After `plot.arm`."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+
+from ..analysis.derivatives import Ellipsoid
+from ..solution.equilibrium import Equilibrium
+from .plot import COLORS, equal_scale
+
+_SHARE = 0.08
+"""Length of what is drawn, as a share of the arm's."""
+
+
+def frames(eq: Equilibrium, ax: Any = None, *, stations: int = 6, size: float | None = None) -> Any:
+    """Axes of sections along the arm: x, along it, then y and z, in three colours.
+
+    **Arguments:** `ax`: 3D axes, new ones by default; `stations`: how many sections; `size`: length
+    of the axes [m].
+
+    **Returns:** the axes.
+    """
+    ax, length = _axes(ax), float(eq.scene.rod.length)
+    poses = np.asarray(eq.pose(jnp.linspace(0, length, stations)))
+    for i, (name, color) in enumerate(zip("xyz", (COLORS[1], COLORS[2], COLORS[0]), strict=True)):
+        arrows = _SHARE * length if size is None else size
+        ax.quiver(
+            *poses[:, :3, 3].T,
+            *(arrows * poses[:, :3, i].T),
+            color=color,
+            linewidth=1.2,
+            arrow_length_ratio=0.0,
+            label=name,
+        )
+    equal_scale(ax)
+    return ax
+
+
+def loads(eq: Equilibrium, ax: Any = None, *, color: Any = COLORS[1]) -> Any:
+    """Forces of the loads as arrows, at points and along the arm; the longest is a sixth of the
+    arm.
+
+    **Arguments:** `ax`: 3D axes, new ones by default; `color`: of the arrows.
+
+    **Returns:** the axes.
+    """
+    ax, length = _axes(ax), float(eq.scene.rod.length)
+    for here, force in _forces(eq, length):
+        longest = np.max(np.linalg.norm(force, axis=-1), initial=0.0)
+        if longest > 0:
+            ax.quiver(
+                *here.T,
+                *(2 * _SHARE * length / longest * force.T),
+                color=color,
+                linewidth=1.2,
+                arrow_length_ratio=0.25,
+            )
+            ends = here + 2 * _SHARE * length / longest * force
+            ax.auto_scale_xyz(
+                *ends.T, had_data=True
+            )  # else the limits are those of these ends alone
+    equal_scale(ax)
+    return ax
+
+
+def _forces(eq: Equilibrium, length: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Places [m] and forces in the world's axes: those at points, those along the arm by length."""
+    found = []
+    for frame in ("world", "body"):
+        points = eq.scene.point_wrenches(frame)
+        X = jnp.stack([x for x, _ in points]) if points else jnp.zeros(0)
+        force = (
+            jnp.stack([jnp.stack(wrench[3:]) for _, wrench in points])
+            if points
+            else jnp.zeros((0, 3))
+        )
+        found.append((X, force, frame))
+        X = jnp.linspace(0, length, 12)
+        density = eq.scene.density(X, frame)
+        if density is not None:
+            found.append((X, jnp.stack(density[3:], axis=-1), frame))
+    drawn = []
+    for X, force, frame in found:
+        if X.size:
+            poses = np.asarray(eq.pose(X))
+            turned = (
+                np.einsum("xij,xj->xi", poses[:, :3, :3], np.asarray(force))
+                if frame == "body"
+                else np.asarray(force)
+            )
+            drawn.append((poses[:, :3, 3], turned))
+    return drawn
+
+
+def ellipsoid(
+    shape: Ellipsoid,
+    ax: Any = None,
+    *,
+    scale: float = 1.0,
+    color: Any = COLORS[2],
+    alpha: float = 0.3,
+) -> Any:
+    """An ellipsoid in space, as `manipulability` and `compliance_ellipsoid` make them.
+
+    **Arguments:** `ax`: 3D axes, new ones by default; `scale`: by which its half axes are drawn
+    longer.
+
+    **Returns:** the axes.
+    """
+    ax = _axes(ax)
+    theta, phi = np.meshgrid(np.linspace(0, np.pi, 19), np.linspace(0, 2 * np.pi, 37))
+    ball = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
+    points = np.asarray(shape.centre)[:, None, None] + scale * np.einsum(
+        "ij,jab->iab", np.asarray(shape.axes), ball
+    )
+    ax.plot_surface(*points, color=color, alpha=alpha, linewidth=0, rasterized=True)
+    equal_scale(ax)
+    return ax
+
+
+def _axes(ax: Any) -> Any:
+    if ax is None:
+        ax = plt.figure(figsize=(6, 5)).add_subplot(projection="3d")
+        ax.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+    return ax

@@ -1,0 +1,309 @@
+"""Pictures of solved arms with matplotlib; every function draws into the axes it is given, or makes
+its own.
+
+The package never imports this module by itself: `from vsr_jax import plot`.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+from jaxtyping import Array
+from matplotlib.colors import to_rgb
+from matplotlib.ticker import MaxNLocator
+from mpl_toolkits.mplot3d.axes3d import Axes3D
+
+from ..arm.rod import STRAINS
+from ..solution.equilibrium import Equilibrium
+from ..validation import choice, on_arm
+
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+"""Colours of Okabe and Ito, which stay apart for colour-blind readers."""
+
+LABELS: dict[str, str] = dict(
+    zip(
+        STRAINS,
+        ("$k_x$ [1/m]", "$k_y$ [1/m]", "$k_z$ [1/m]", "$u_x$ [-]", "$u_y$ [-]", "$u_z$ [-]"),
+        strict=True,
+    )
+)
+"""Symbol and unit of each strain."""
+
+_ANGLES = 24
+_LEAST_SPAN = 0.02
+_THINNEST_BOX = 0.35
+
+
+class Samples(NamedTuple):
+    """An equilibrium at stations, in NumPy arrays.
+
+    **Fields:** abscissas `X` [m], shape (stations,); `pose` (stations, 4, 4); `strain` (stations,
+    6); `threads` [m], shape (threads, stations, 3); `wall` [m], the outer wall, shape (stations,
+    angles, 3).
+    """
+
+    X: np.ndarray
+    pose: np.ndarray
+    strain: np.ndarray
+    threads: np.ndarray
+    wall: np.ndarray
+
+    @property
+    def position(self) -> np.ndarray:
+        """Position [m] of the axis, shape (stations, 3)."""
+        return self.pose[:, :3, 3]
+
+
+def sample(eq: Equilibrium, stations: Any = 60, *, program: Callable | None = None) -> Samples:
+    """Everything the pictures need of an equilibrium, computed once; `arm` and `strains` take it in
+    place of `eq`.
+
+    **Arguments:** `stations`: how many, evenly spaced on the arm, or their abscissas [m];
+    `program`: what `sampling` compiled.
+
+    **Raises:** `ValueError` for a batch of equilibria, for one that did not converge and for
+    stations beyond the arm.
+    """
+    if np.ndim(eq.status) > 0:
+        raise ValueError(f"eq: got a batch of shape {np.shape(eq.status)}, need one equilibrium")
+    if not bool(eq.converged):
+        raise ValueError(f"eq: got a solve that failed ({eq.message}), need a converged one")
+    X = _abscissas(eq, stations)
+    pose, strain, threads, wall = (
+        np.asarray(part) for part in (program or _along)(eq, jnp.asarray(X, eq.inputs.dtype))
+    )
+    return Samples(X, pose, strain, _sweep(pose, threads).swapaxes(0, 1), _sweep(pose, wall))
+
+
+def sampling(eq: Equilibrium, stations: Any = 60) -> Callable:
+    """The program by which `sample` works, compiled: for this equilibrium and for all of the same
+    model and kind of scene."""
+    X = jnp.asarray(_abscissas(eq, stations), eq.inputs.dtype)
+    return _along.lower(eq, X).compile()  # pyright: ignore[reportFunctionMemberAccess]
+
+
+def _abscissas(eq: Equilibrium, stations: Any) -> np.ndarray:
+    if isinstance(stations, int | np.integer):
+        return np.linspace(0.0, float(eq.scene.rod.length), stations)
+    on_arm("stations", stations, eq.scene.rod.length)
+    return np.asarray(stations)
+
+
+@eqx.filter_jit
+def _along(eq: Equilibrium, X: Array) -> tuple[Array, Array, Array, Array]:
+    """Poses and strains at X, and where threads and wall cross the sections: (y, z), (stations,
+    threads or angles, 2)."""
+    rod = eq.scene.rod
+    angle = jnp.linspace(0.0, 2 * np.pi, _ANGLES + 1).astype(X.dtype)
+    wall = jax.vmap(lambda x: jnp.stack(rod.section.outline(angle, x, rod.length), axis=-1))(X)
+    sections = eq.scene.sections(X)
+    paths = [jnp.stack((path.y, path.z), axis=-1) for path in sections.paths]
+    # beyond its ends there is no thread to draw
+    paths = [
+        p if r is None else jnp.where(r[:, None] > 0, p, jnp.nan)
+        for p, r in zip(paths, sections.reach, strict=True)
+    ]
+    threads = jnp.stack(paths, axis=1) if paths else jnp.zeros((X.size, 0, 2), X.dtype)
+    return eq.pose(X), eq.strain(X), threads, wall
+
+
+def _sweep(pose: np.ndarray, yz: np.ndarray) -> np.ndarray:
+    """Points (stations, points, 3) [m] of sections carried along the poses."""
+    return pose[:, None, :3, 3] + np.einsum("xij,xpj->xpi", pose[:, :3, 1:3], yz)
+
+
+def arm(
+    eq: Equilibrium | Samples,
+    ax: Any = None,
+    *,
+    color: Any = COLORS[0],
+    label: str | None = None,
+    linestyle: Any = "-",
+    stations: Any = 60,
+    surface: bool = True,
+    threads: bool = True,
+    **line: Any,
+) -> Any:
+    """The deformed arm in space: its axis, its translucent outer wall and its threads, to equal
+    scale.
+
+    **Arguments:**
+    - `eq`: an equilibrium, or what `sample` made of it.
+    - `ax`: 3D axes; a new figure by default.
+    - `color`, `label`, `linestyle`, `line`: properties of the axis curve, as matplotlib knows them.
+    - `stations`: how many stations, or their abscissas [m]; not used with `Samples`.
+    - `surface`, `threads`: whether to draw the wall and the threads.
+
+    **Returns:** the axes.
+    """
+    samples = eq if isinstance(eq, Samples) else sample(eq, stations)
+    ax = plt.figure(figsize=(6, 5)).add_subplot(projection="3d") if ax is None else ax
+    if not isinstance(ax, Axes3D):
+        raise ValueError(
+            f"ax: got {type(ax).__name__}, need 3D axes, as from "
+            f"figure.add_subplot(projection='3d')"
+        )
+    if surface:
+        x, y, z = np.moveaxis(samples.wall, -1, 0)
+        ax.plot_surface(
+            x,
+            y,
+            z,
+            color=color,
+            alpha=0.18,
+            linewidth=0,
+            rcount=60,
+            ccount=_ANGLES,
+            rasterized=True,
+        )
+    if threads:
+        for thread in samples.threads:
+            ax.plot(*thread.T, color=shade(color), linewidth=0.8)
+    ax.plot(*samples.position.T, color=color, label=label, linestyle=linestyle, **line)
+    ax.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+    equal_scale(ax)
+    return ax
+
+
+def equal_scale(ax: Any, *, zoom: float = 1.1) -> None:
+    """One scale for x, y and z: the box takes the proportions of what is drawn, no side thinner
+    than a third of the longest.
+
+    **Arguments:** `ax`: 3D axes; `zoom`: size of the box in them.
+    """
+    low = np.array([*ax.xy_dataLim.min, ax.zz_dataLim.x0])
+    high = np.array([*ax.xy_dataLim.max, ax.zz_dataLim.x1])
+    span = np.maximum(high - low, _THINNEST_BOX * np.max(high - low)) * 1.04
+    sides = zip(
+        *_around((low + high) / 2, span),
+        span / span.max(),
+        (ax.xaxis, ax.yaxis, ax.zaxis),
+        ("x", "y", "z"),
+        strict=True,
+    )
+    for start, end, width, axis, name in sides:
+        ticks = MaxNLocator(4 if width > 0.6 else 2, steps=[1, 2, 2.5, 4, 5, 10]).tick_values(
+            start, end
+        )
+        margin = 0.06 * (end - start)  # ticks at a corner would run into those of the next side
+        axis.set_ticks(ticks[(ticks > start + margin) & (ticks < end - margin)])
+        ax.set(**{f"{name}lim": (start, end)})
+    ax.set_box_aspect(span, zoom=zoom)
+
+
+def _around(middle: Any, span: Any) -> tuple[Any, Any]:
+    return middle - span / 2, middle + span / 2
+
+
+def strains(
+    eq: Equilibrium | Samples,
+    ax: Any = None,
+    *,
+    names: Sequence[str] = STRAINS,
+    color: Any = COLORS[0],
+    label: str | None = None,
+    linestyle: Any = "-",
+    stations: Any = 60,
+    **line: Any,
+) -> np.ndarray:
+    """The strains over X, one panel each; no panel spans less than 0.02, so that rounding does not
+    look like a signal.
+
+    **Arguments:**
+    - `eq`: an equilibrium, or what `sample` made of it.
+    - `ax`: one axes a name, in a row or a grid; a new figure by default, of 2 x 3 panels for all
+      six strains.
+    - `names`: which of `vsr_jax.rod.STRAINS`.
+    - `color`, `label`, `linestyle`, `line`: properties of the curves, as matplotlib knows them.
+    - `stations`: how many stations, or their abscissas [m]; not used with `Samples`.
+
+    **Returns:** the axes, one a name.
+    """
+    indices = [STRAINS.index(choice("names", name, STRAINS)) for name in names]
+    samples = eq if isinstance(eq, Samples) else sample(eq, stations)
+    axes = _panels(len(indices)) if ax is None else np.asarray(ax, dtype=object).reshape(-1)
+    if len(axes) != len(indices):
+        raise ValueError(f"ax: got {len(axes)} axes, need {len(indices)}, one a name")
+    for panel, name, index in zip(axes, names, indices, strict=True):
+        panel.plot(
+            samples.X,
+            samples.strain[:, index],
+            color=color,
+            label=label,
+            linestyle=linestyle,
+            **line,
+        )
+        panel.set(xlabel="X [m]", ylabel=LABELS[name], xlim=(samples.X.min(), samples.X.max()))
+        panel.ticklabel_format(axis="y", useOffset=False)
+        low, high = panel.dataLim.intervaly
+        panel.set_ylim(*_around((low + high) / 2, max(1.12 * (high - low), _LEAST_SPAN)))
+    return axes
+
+
+def _panels(number: int) -> np.ndarray:
+    columns = min(number, 3)
+    rows = -(-number // columns)
+    figure, axes = plt.subplots(
+        rows, columns, figsize=(3.6 * columns, 2.5 * rows), squeeze=False, layout="constrained"
+    )
+    for unused in axes.flat[number:]:
+        figure.delaxes(unused)
+    return axes.reshape(-1)[:number]
+
+
+def workspace(
+    positions: Any,
+    ax: Any = None,
+    *,
+    values: Any = None,
+    label: str = "",
+    color: Any = COLORS[0],
+    most: int = 20_000,
+) -> np.ndarray:
+    """Where the tip gets: a cloud of points in space, and seen along each axis.
+
+    **Arguments:**
+    - `positions`: shape (samples, 3) [m]; rows with a NaN are left out.
+    - `ax`: four axes, the first one 3D; a new figure by default.
+    - `values`, `label`: a number for each point that colours it, and what it is; all of one `color`
+      without.
+    - `most`: how many points are drawn; of more, every so-manieth.
+
+    **Returns:** the axes: in space, then y over x, z over x, z over y.
+    """
+    positions = np.asarray(positions)
+    if positions.ndim != 2 or positions.shape[1] != 3:
+        raise ValueError(f"positions: got shape {positions.shape}, need (samples, 3)")
+    shown = np.flatnonzero(np.all(np.isfinite(positions), axis=1))
+    shown = shown[:: -(-len(shown) // most) or 1]
+    axes = _corner() if ax is None else np.asarray(ax, dtype=object).reshape(-1)
+    points = positions[shown].T
+    style: dict[str, Any] = {"s": 2, "linewidths": 0, "rasterized": True}
+    style |= {"c": color} if values is None else {"c": np.asarray(values)[shown], "cmap": "viridis"}
+    cloud = axes[0].scatter(*points, alpha=0.5, **style)
+    axes[0].set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+    equal_scale(axes[0])
+    for panel, (i, j) in zip(axes[1:], ((0, 1), (0, 2), (1, 2)), strict=True):
+        panel.scatter(points[i], points[j], **style)
+        panel.set(xlabel=f"{'xyz'[i]} [m]", ylabel=f"{'xyz'[j]} [m]")
+        panel.set_aspect("equal", adjustable="box")
+    if values is not None:
+        axes[0].figure.colorbar(cloud, ax=list(axes), label=label, shrink=0.6).solids.set_alpha(1)
+    return axes
+
+
+def _corner() -> np.ndarray:
+    figure = plt.figure(figsize=(9, 7), layout="constrained")
+    return np.array(
+        [figure.add_subplot(2, 2, i + 1, projection="3d" if i == 0 else None) for i in range(4)],
+        dtype=object,
+    )
+
+
+def shade(color: Any) -> tuple[float, ...]:
+    """A darker tone of a colour, for what is drawn over it."""
+    return tuple(0.55 * part for part in to_rgb(color))
