@@ -46,7 +46,7 @@ def catheter() -> vsr.Scene:
 def dense(eq: Equilibrium, there: np.ndarray) -> jax.Array:
     """All eigenvalues of the symmetric part of the scaled tangent, as before Lanczos' method;
     `there`: places of unknowns with weight."""
-    nodes, tau = eq._nodes(), eq._nodes().tau(eq._sound_forces)
+    nodes, tau = eq.nodes, eq.nodes.tau(eq.sound_forces)
     grid, loads = nodes.grid, loading(eq.scene, nodes.grid)
     assert loads is not None
     still = jnp.stack(nodes.xi)
@@ -97,7 +97,7 @@ def main() -> None:
         return eqx.filter(vsr.solve(scene, inputs, model=model), eqx.is_array)
 
     def margin(eq: Equilibrium) -> Any:
-        return extreme(eq.scene, eq._sound_forces, eq._nodes())
+        return extreme(eq.scene, eq.sound_forces, eq.nodes)
 
     def slope(scene: vsr.Scene, inputs: jax.Array) -> Any:
         return jax.grad(lambda inputs: vsr.solve(scene, inputs, model=model).stability)(inputs)

@@ -421,7 +421,7 @@ def test_another_sweep_is_refused(tmp_path):
             r"a \(23,\), inputs_b \(3,\), need",
         ),
         ({"scene": "arm"}, "sweep.scene: got 'arm', need a Scene"),
-        ({"outputs": "height"}, "sweep.outputs: got 'height', need some of tip, lengths"),
+        ({"outputs": "height"}, "sweep.outputs: got 'height', need some of tip, stability"),
         ({"outputs": lambda eq: eq.tip}, "need arrays by name"),
         ({"outputs": lambda eq: {"status": eq.status}}, "need other names than status"),
         ({"chunk": 0}, "sweep.chunk: got 0, need an integer >= 1"),

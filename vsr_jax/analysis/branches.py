@@ -173,11 +173,11 @@ def _system(scene: Any, path: Any, start: Equilibrium) -> tuple[_System, Array]:
     problem, kind = problem_of(start.scene, start.inputs, model.grid(start.scene))
     length, share = jnp.sum(problem.grid.h), jnp.sqrt(problem.grid.weight / jnp.sum(problem.grid.h))
     axial = jnp.sum(problem.grid.weight * problem.sections.stiffness[3]) / length
-    tension = tuple(-start._forces[place] for place in kind.cables)
-    turning = start._state.turning
+    tension = tuple(-start.sound_forces[place] for place in kind.cables)
+    turning = start.state.turning
     parts = [
         (x, share * length if i < 3 else share)
-        for i, x in zip(kind.free, chosen(start._state.xi, kind.free), strict=True)
+        for i, x in zip(kind.free, chosen(start.state.xi, kind.free), strict=True)
     ]
     parts += [(x, 1 / axial) for x in tension] + [(x, share * length) for x in turning]
     values, scale = (

@@ -148,20 +148,20 @@ def compliance(eq: Equilibrium) -> Float[Array, "6 6"]:
 @eqx.filter_jit
 def _compliance(eq: Equilibrium) -> Array:
     if eq.scene.coupled or not eq.model.balanced_everywhere:
-        return eq._mask(
-            jax.jacfwd(lambda wrench: _motion(_pushed(eq, wrench).tip, eq.tip))(
-                jnp.zeros(6, eq.inputs.dtype)
-            )
+        found = jax.jacfwd(lambda wrench: _motion(_pushed(eq, wrench).tip, eq.tip))(
+            jnp.zeros(6, eq.inputs.dtype)
         )
-    nodes, free = eq._nodes(), jnp.array(eq.scene.free)
-    rows = tangent(nodes.xi, nodes.sections, nodes.tau(eq._sound_forces))
+        return jnp.where(eq.converged, found, jnp.nan)
+    nodes, free = eq.nodes, jnp.array(eq.scene.free)
+    rows = tangent(nodes.xi, nodes.sections, nodes.tau(eq.sound_forces))
     H = c.join_matrix(c.symmetric(chosen_rows(rows, eq.scene.free))).reshape(
         -1, free.size, free.size
     )
-    poses = eq._poses(nodes.grid.X.reshape(-1))
+    poses = eq.pose(nodes.grid.X.reshape(-1))
     G = jax.vmap(lambda g: _carried(g, eq.tip))(poses)[:, free]
     weight = jnp.broadcast_to(nodes.grid.weight, nodes.grid.X.shape).reshape(-1)
-    return eq._mask(jnp.einsum("x,xai,xaj->ij", weight, G, jnp.linalg.solve(H, G)))
+    found = jnp.einsum("x,xai,xaj->ij", weight, G, jnp.linalg.solve(H, G))
+    return jnp.where(eq.converged, found, jnp.nan)
 
 
 def _pushed(eq: Equilibrium, wrench: Float[Array, "6"]) -> Equilibrium:

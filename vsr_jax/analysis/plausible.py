@@ -168,7 +168,7 @@ def _measured(scene: Scene) -> _Measures:
 
 @eqx.filter_jit
 def _largest_strain(eq: Equilibrium) -> Array:
-    nodes, rod = eq._nodes(), eq.scene.rod
+    nodes, rod = eq.nodes, eq.scene.rod
     zero = jnp.zeros_like(rod.length)
     thickness = jax.vmap(lambda x: rod.section.clearance(zero, zero, x, rod.length))(
         nodes.grid.X.reshape(-1)

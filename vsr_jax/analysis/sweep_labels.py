@@ -16,6 +16,8 @@ from ..models.base import Model, Status
 from ..models.basis import Basis
 from ..models.prescribed import Prescribed
 from ..models.strain_dependent import StrainDependent
+from ..solution.energy import Energy
+from ..solution.quantities import QUANTITIES
 from .sweep_program import Task, number
 
 
@@ -41,35 +43,9 @@ class _Coordinate(NamedTuple):
     values: np.ndarray
 
 
-_QUANTITIES = {
-    "tip": (
-        ("row", "column"),
-        "see column_units",
-        "pose of the tip, axes of its section and position",
-    ),
-    "lengths": (("actuator",), "m", "length of the thread's path"),
-    "forces": (
-        ("actuator",),
-        "N",
-        "signed force of the thread at its start, negative for a tendon",
-    ),
-    "slack": (("actuator",), "m", "length of cable that hangs loose"),
-    "stability": (
-        (),
-        "1",
-        "stability margin, the least eigenvalue of the scaled tangent stiffness",
-    ),
-    "condition": ((), "1", "condition number of the scaled tangent stiffness"),
-    "q": (("dof",), "see dof_units", "coordinates of the strain in the model's basis"),
-    "steps": ((), "1", "steps of the solver"),
-}
-"""Dimensions besides the samples, unit and description of the outputs known by name."""
+_STEPS = Label(("sample",), {"long_name": "Newton steps", "units": "1"})
 
-_FORCES_AS_Q = (
-    ("actuator",),
-    "N",
-    "coordinates of the strain in the model's basis: the thread forces",
-)
+_FORCES_AS_Q = "Coordinates of the strain in the model's basis: the thread forces"
 
 _STATUS = {
     "long_name": "how the solve ended",
@@ -77,7 +53,7 @@ _STATUS = {
     "flag_meanings": " ".join(status.name.lower() for status in Status),
 }
 
-_POSE = {
+_AXES = {
     "row": _Coordinate(
         "row",
         "component in the world frame, w: last row of the homogeneous matrix",
@@ -91,7 +67,9 @@ _POSE = {
     "column_units": _Coordinate(
         "column", "unit of each column of the pose", np.array(["1", "1", "1", "m"])
     ),
+    "part": _Coordinate("part", "part of the energy", np.array(Energy._fields)),
 }
+"""Coordinates of the axes that quantities of the table have, by name."""
 
 
 def labels(
@@ -110,7 +88,7 @@ def labels(
     named = () if callable(task.outputs) else task.outputs
     coordinates = (
         _actuators(scene)
-        | (_POSE if "tip" in named else {})
+        | _axes(named)
         | (_dofs(model, like["q"].shape[1]) if "q" in named else {})
     )
     arrays = {
@@ -122,6 +100,12 @@ def labels(
     arrays |= {name: Label((c.dim,), {"long_name": c.long_name}) for name, c in coordinates.items()}
     values = {name: c.values for name, c in coordinates.items()}
     return Labels(arrays, values, _attributes(task, model, number(samples), inputs.dtype))
+
+
+def _axes(named: tuple[str, ...]) -> dict[str, _Coordinate]:
+    """Coordinates of the axes of the named quantities."""
+    dims = {dim for name in named if name != "steps" for dim in QUANTITIES[name].dims or ()}
+    return {name: axis for name, axis in _AXES.items() if axis.dim in dims}
 
 
 def _given(task: Task, sample: Any) -> tuple[Scene, Any]:
@@ -183,9 +167,12 @@ def _output(name: str, x: Any, named: bool, coordinates: Mapping[str, _Coordinat
             {"long_name": f"output {name} of the function given to the sweep"},
             coordinates,
         )
-    dims, unit, long_name = (
-        _FORCES_AS_Q if name == "q" and "dof" not in coordinates else _QUANTITIES[name]
-    )
+    if name == "steps":
+        return _STEPS
+    entry = QUANTITIES[name]
+    dims, unit, long_name = entry.dims or (), entry.unit, entry.description
+    if name == "q" and "dof" not in coordinates:
+        dims, unit, long_name = ("actuator",), "N", _FORCES_AS_Q
     return _labelled(("sample", *dims), {"long_name": long_name, "units": unit}, coordinates)
 
 

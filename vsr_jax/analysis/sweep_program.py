@@ -47,7 +47,9 @@ class Task(eqx.Module):
                     f"arrays by name, as a dict"
                 )
         else:
-            wanted = {name: getattr(eq, name) for name in self.outputs}
+            wanted = {
+                name: eq.steps if name == "steps" else eq.value(name) for name in self.outputs
+            }
         taken = [name for name in wanted if name == "status" or name.startswith("inputs")]
         if taken:
             raise ValueError(

@@ -15,13 +15,19 @@ from ..arm.scene import Scene
 from ..models.base import Model, Status
 from ..numerics.fingerprint import fingerprint
 from ..solution.equilibrium import Equilibrium
+from ..solution.quantities import QUANTITIES, Quantity
 from ..validation import count
 from .sweep_labels import labels
 from .sweep_program import Program, Task, number
 from .sweep_store import Archive, InMemory
 
-OUTPUTS = ("tip", "lengths", "forces", "slack", "stability", "condition", "q", "steps")
-"""Quantities of an `Equilibrium` that a sweep knows by name."""
+
+def known_outputs() -> tuple[str, ...]:
+    """Names of the quantities that a sweep can store: those of the table that are one array and no
+    function of X, and the solver's `steps`."""
+    table = (entry for entry in QUANTITIES.values() if isinstance(entry, Quantity))
+    return (*(entry.name for entry in table if entry.dims is not None), "steps")
+
 
 _CHUNK = 16_384
 _MEMORY = 1 << 30
@@ -98,9 +104,9 @@ def sweep(
     - `scene`: a scene, or a function from one sample to a scene and the inputs of its actuators.
     - `inputs`: the samples, shape (samples, actuators); for a function any pytree of arrays whose
       first axis is the samples.
-    - `outputs`: names among `tip`, `lengths`, `forces`, `slack`, `stability`, `condition`, `q` and
-      `steps`, or a function from an `Equilibrium` to arrays by name; only what is asked for is
-      computed.
+    - `outputs`: names of quantities of an `Equilibrium` that are one array (`tip`, `lengths`,
+      `forces`, `slack`, `stability`, `condition`, `energy`, `q`, or one added to the table) and
+      `steps`, or a function from an `Equilibrium` to arrays by name; nothing else is computed.
     - `model`: as for `solve`.
     - `out`: a folder for Zarr (`pip install "vsr-jax[sweep]"`), which `xarray.open_zarr` reads: see
       below. Each chunk is written when it is done. The same call resumes a sweep that was killed,
@@ -181,11 +187,12 @@ def _named(outputs: Outputs) -> tuple[str, ...] | Callable:
     if callable(outputs):
         return outputs
     names = (outputs,) if isinstance(outputs, str) else tuple(outputs)
-    unknown = [name for name in names if name not in OUTPUTS]
+    known = known_outputs()
+    unknown = [name for name in names if name not in known]
     if unknown:
         raise ValueError(
             f"sweep.outputs: got {', '.join(map(repr, unknown))}, need some of "
-            f"{', '.join(OUTPUTS)}, or a function"
+            f"{', '.join(known)}, or a function"
         )
     return names
 

@@ -10,7 +10,7 @@ from ..analysis.health import MOST_FACTOR, Health, Limit
 from ..models.base import Status
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
-from ..viz.plot import Samples
+from ..solution.summary import Summary
 
 
 def lines(eq: Equilibrium, title: str = "", *, error: bool = False) -> list[str]:
@@ -43,7 +43,7 @@ def lines(eq: Equilibrium, title: str = "", *, error: bool = False) -> list[str]
     return text + _threads(eq)
 
 
-def record(eq: Equilibrium, samples: Samples | None) -> dict[str, Any]:
+def record(eq: Equilibrium, samples: Summary | None) -> dict[str, Any]:
     """An equilibrium as numbers, texts and lists, with None for what a failed solve does not know.
 
     **Arguments:** `eq`: one equilibrium; `samples`: the same at the stations to tell of, None for a

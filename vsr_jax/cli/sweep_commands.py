@@ -10,7 +10,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from ..analysis.sweeping import OUTPUTS, Sweep, sweep
+from ..analysis.sweeping import Sweep, known_outputs, sweep
 from .common import (
     DONE,
     NOT_CONVERGED,
@@ -54,7 +54,7 @@ def add_sweep(commands: Any) -> None:
     parser.add_argument(
         "--outputs",
         nargs="+",
-        choices=OUTPUTS,
+        choices=known_outputs(),
         default=["tip"],
         help="what to keep besides the status (default: tip)",
     )

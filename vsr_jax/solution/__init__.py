@@ -1,11 +1,27 @@
-"""One equilibrium: how it is asked for, what it tells, how stable it is and how large its error.
+"""One equilibrium: the solve, the table of its quantities, its stability margin and its error.
 
 Must not know of many solves: what needs them lies in `analysis`.
 """
 
+from .energy import Energy
 from .equilibrium import Equilibrium
 from .estimate import Error
+from .quantities import QUANTITIES, along_arm, quantity
 from .solver import SolveError, outcome_of, solve
 from .step_choice import Plan, plan
+from .summary import Summary
 
-__all__ = ["Equilibrium", "Error", "Plan", "SolveError", "outcome_of", "plan", "solve"]
+__all__ = [
+    "QUANTITIES",
+    "Energy",
+    "Equilibrium",
+    "Error",
+    "Plan",
+    "SolveError",
+    "Summary",
+    "along_arm",
+    "outcome_of",
+    "plan",
+    "quantity",
+    "solve",
+]

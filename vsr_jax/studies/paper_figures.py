@@ -11,10 +11,11 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from ..arm.rod import STRAINS
-from ..viz.plot import COLORS, LABELS, Samples, arm, equal_scale, shade, strains
+from ..solution.summary import Summary
+from ..viz.plot import COLORS, LABELS, arm, equal_scale, shade, strains
 from . import paper
 
-Curves = Mapping[tuple[str, tuple[float, ...], str], Samples]
+Curves = Mapping[tuple[str, tuple[float, ...], str], Summary]
 """Curves by (case, tau, model)."""
 
 _FONT: dict[Any, Any] = {

@@ -22,8 +22,9 @@ from ..models.prescribed import Prescribed
 from ..models.strain_dependent import StrainDependent
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
+from ..solution.summary import Summary
 from ..validation import choice
-from ..viz.plot import Samples, sample, sampling
+from ..viz.plot import sample, sampling
 from . import paper, paper_figures
 
 STATIONS = np.linspace(0.0, paper.LENGTH, 61)
@@ -68,7 +69,7 @@ class Result(NamedTuple):
     """A row of the table and the curves of its solution, None where the solve failed."""
 
     row: Row
-    samples: Samples | None
+    samples: Summary | None
 
 
 def models(case: str) -> dict[str, Model]:
@@ -162,7 +163,7 @@ def _program(group: dict[int, Equilibrium]) -> Callable:
     return sampling(next(iter(group.values())), STATIONS)
 
 
-def _curves(group: dict[int, Equilibrium], program: Callable) -> dict[int, Samples | None]:
+def _curves(group: dict[int, Equilibrium], program: Callable) -> dict[int, Summary | None]:
     return {
         index: sample(eq, STATIONS, program=program) if bool(eq.converged) else None
         for index, eq in group.items()
@@ -175,7 +176,7 @@ def _row(
     model: Model,
     solution: paper.Solution,
     solved: _Solved,
-    samples: Samples | None,
+    samples: Summary | None,
 ) -> Row:
     tip = np.asarray(solved.eq.tip)[:3, 3]
     tip_error = float(np.linalg.norm(tip - solution.tip[:3, 3]))
@@ -204,7 +205,7 @@ def _dofs(model: Model, threads: int) -> int | None:
     )
 
 
-def _strain_error(samples: Samples | None, solution: paper.Solution) -> float:
+def _strain_error(samples: Summary | None, solution: paper.Solution) -> float:
     if samples is None:
         return float("nan")
     scale = np.maximum(1.0, np.max(np.abs(solution.strain), axis=0))

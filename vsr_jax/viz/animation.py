@@ -9,12 +9,12 @@ import numpy as np
 from matplotlib.animation import FuncAnimation, PillowWriter
 
 from ..solution.equilibrium import Equilibrium
+from ..solution.summary import Summary
 from . import plot
-from .plot import Samples
 
 
 def film(
-    equilibria: Sequence[Equilibrium | Samples],
+    equilibria: Sequence[Equilibrium | Summary],
     path: str | os.PathLike[str] | None = None,
     *,
     titles: Sequence[str] | None = None,
@@ -34,7 +34,7 @@ def film(
     **Raises:** `ValueError` for no equilibria, for one that did not converge, and for another
     number of titles.
     """
-    frames = [eq if isinstance(eq, Samples) else plot.sample(eq, 40) for eq in equilibria]
+    frames = [eq if isinstance(eq, Summary) else plot.sample(eq, 40) for eq in equilibria]
     if not frames:
         raise ValueError("equilibria: got none, need at least one")
     if titles is not None and len(titles) != len(frames):

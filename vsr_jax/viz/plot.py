@@ -5,13 +5,13 @@ The package never imports this module by itself: `from vsr_jax import plot`.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array
 from matplotlib.colors import to_rgb
 from matplotlib.ticker import MaxNLocator
@@ -19,6 +19,7 @@ from mpl_toolkits.mplot3d.axes3d import Axes3D
 
 from ..arm.rod import STRAINS
 from ..solution.equilibrium import Equilibrium
+from ..solution.summary import ANGLES, Summary, compiled_summary
 from ..validation import choice, on_arm
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -33,34 +34,14 @@ LABELS: dict[str, str] = dict(
 )
 """Symbol and unit of each strain."""
 
-_ANGLES = 24
 _LEAST_SPAN = 0.02
 _THINNEST_BOX = 0.35
 
 
-class Samples(NamedTuple):
-    """An equilibrium at stations, in NumPy arrays.
-
-    **Fields:** abscissas `X` [m], shape (stations,); `pose` (stations, 4, 4); `strain` (stations,
-    6); `threads` [m], shape (threads, stations, 3); `wall` [m], the outer wall, shape (stations,
-    angles, 3).
-    """
-
-    X: np.ndarray
-    pose: np.ndarray
-    strain: np.ndarray
-    threads: np.ndarray
-    wall: np.ndarray
-
-    @property
-    def position(self) -> np.ndarray:
-        """Position [m] of the axis, shape (stations, 3)."""
-        return self.pose[:, :3, 3]
-
-
-def sample(eq: Equilibrium, stations: Any = 60, *, program: Callable | None = None) -> Samples:
-    """Everything the pictures need of an equilibrium, computed once; `arm` and `strains` take it in
-    place of `eq`.
+def sample(
+    eq: Equilibrium, stations: ArrayLike = 60, *, program: Callable | None = None
+) -> Summary:
+    """The summary of an equilibrium in NumPy arrays; `arm` and `strains` take it in place of `eq`.
 
     **Arguments:** `stations`: how many, evenly spaced on the arm, or their abscissas [m];
     `program`: what `sampling` compiled.
@@ -72,58 +53,31 @@ def sample(eq: Equilibrium, stations: Any = 60, *, program: Callable | None = No
         raise ValueError(f"eq: got a batch of shape {np.shape(eq.status)}, need one equilibrium")
     if not bool(eq.converged):
         raise ValueError(f"eq: got a solve that failed ({eq.message}), need a converged one")
-    X = _abscissas(eq, stations)
-    pose, strain, threads, wall = (
-        np.asarray(part) for part in (program or _along)(eq, jnp.asarray(X, eq.inputs.dtype))
-    )
-    return Samples(X, pose, strain, _sweep(pose, threads).swapaxes(0, 1), _sweep(pose, wall))
+    on_arm("stations", _abscissas(eq, stations), eq.scene.rod.length)
+    found = eq.summary(stations) if program is None else program(eq, _abscissas(eq, stations))
+    return jax.tree.map(np.asarray, found)
 
 
-def sampling(eq: Equilibrium, stations: Any = 60) -> Callable:
-    """The program by which `sample` works, compiled: for this equilibrium and for all of the same
-    model and kind of scene."""
-    X = jnp.asarray(_abscissas(eq, stations), eq.inputs.dtype)
-    return _along.lower(eq, X).compile()  # pyright: ignore[reportFunctionMemberAccess]
+def sampling(eq: Equilibrium, stations: ArrayLike = 60) -> Callable:
+    """The program of `sample`, compiled: for this equilibrium and for all of the same model and
+    kind of scene."""
+    return compiled_summary(eq, _abscissas(eq, stations))
 
 
-def _abscissas(eq: Equilibrium, stations: Any) -> np.ndarray:
+def _abscissas(eq: Equilibrium, stations: ArrayLike) -> Array:
     if isinstance(stations, int | np.integer):
-        return np.linspace(0.0, float(eq.scene.rod.length), stations)
-    on_arm("stations", stations, eq.scene.rod.length)
-    return np.asarray(stations)
-
-
-@eqx.filter_jit
-def _along(eq: Equilibrium, X: Array) -> tuple[Array, Array, Array, Array]:
-    """Poses and strains at X, and where threads and wall cross the sections: (y, z), (stations,
-    threads or angles, 2)."""
-    rod = eq.scene.rod
-    angle = jnp.linspace(0.0, 2 * np.pi, _ANGLES + 1).astype(X.dtype)
-    wall = jax.vmap(lambda x: jnp.stack(rod.section.outline(angle, x, rod.length), axis=-1))(X)
-    sections = eq.scene.sections(X)
-    paths = [jnp.stack((path.y, path.z), axis=-1) for path in sections.paths]
-    # beyond its ends there is no thread to draw
-    paths = [
-        p if r is None else jnp.where(r[:, None] > 0, p, jnp.nan)
-        for p, r in zip(paths, sections.reach, strict=True)
-    ]
-    threads = jnp.stack(paths, axis=1) if paths else jnp.zeros((X.size, 0, 2), X.dtype)
-    return eq.pose(X), eq.strain(X), threads, wall
-
-
-def _sweep(pose: np.ndarray, yz: np.ndarray) -> np.ndarray:
-    """Points (stations, points, 3) [m] of sections carried along the poses."""
-    return pose[:, None, :3, 3] + np.einsum("xij,xpj->xpi", pose[:, :3, 1:3], yz)
+        return jnp.linspace(0.0, 1.0, int(stations)) * eq.scene.rod.length
+    return jnp.asarray(stations, eq.inputs.dtype)
 
 
 def arm(
-    eq: Equilibrium | Samples,
+    eq: Equilibrium | Summary,
     ax: Any = None,
     *,
     color: Any = COLORS[0],
     label: str | None = None,
     linestyle: Any = "-",
-    stations: Any = 60,
+    stations: ArrayLike = 60,
     surface: bool = True,
     threads: bool = True,
     **line: Any,
@@ -135,12 +89,12 @@ def arm(
     - `eq`: an equilibrium, or what `sample` made of it.
     - `ax`: 3D axes; a new figure by default.
     - `color`, `label`, `linestyle`, `line`: properties of the axis curve, as matplotlib knows them.
-    - `stations`: how many stations, or their abscissas [m]; not used with `Samples`.
+    - `stations`: how many stations, or their abscissas [m]; not used with a `Summary`.
     - `surface`, `threads`: whether to draw the wall and the threads.
 
     **Returns:** the axes.
     """
-    samples = eq if isinstance(eq, Samples) else sample(eq, stations)
+    samples = eq if isinstance(eq, Summary) else sample(eq, stations)
     ax = plt.figure(figsize=(6, 5)).add_subplot(projection="3d") if ax is None else ax
     if not isinstance(ax, Axes3D):
         raise ValueError(
@@ -157,7 +111,7 @@ def arm(
             alpha=0.18,
             linewidth=0,
             rcount=60,
-            ccount=_ANGLES,
+            ccount=ANGLES,
             rasterized=True,
         )
     if threads:
@@ -200,14 +154,14 @@ def _around(middle: Any, span: Any) -> tuple[Any, Any]:
 
 
 def strains(
-    eq: Equilibrium | Samples,
+    eq: Equilibrium | Summary,
     ax: Any = None,
     *,
     names: Sequence[str] = STRAINS,
     color: Any = COLORS[0],
     label: str | None = None,
     linestyle: Any = "-",
-    stations: Any = 60,
+    stations: ArrayLike = 60,
     **line: Any,
 ) -> np.ndarray:
     """The strains over X, one panel each; no panel spans less than 0.02, so that rounding does not
@@ -219,12 +173,12 @@ def strains(
       six strains.
     - `names`: which of `vsr_jax.rod.STRAINS`.
     - `color`, `label`, `linestyle`, `line`: properties of the curves, as matplotlib knows them.
-    - `stations`: how many stations, or their abscissas [m]; not used with `Samples`.
+    - `stations`: how many stations, or their abscissas [m]; not used with a `Summary`.
 
     **Returns:** the axes, one a name.
     """
     indices = [STRAINS.index(choice("names", name, STRAINS)) for name in names]
-    samples = eq if isinstance(eq, Samples) else sample(eq, stations)
+    samples = eq if isinstance(eq, Summary) else sample(eq, stations)
     axes = _panels(len(indices)) if ax is None else np.asarray(ax, dtype=object).reshape(-1)
     if len(axes) != len(indices):
         raise ValueError(f"ax: got {len(axes)} axes, need {len(indices)}, one a name")
@@ -271,7 +225,7 @@ def workspace(
     - `ax`: four axes, the first one 3D; a new figure by default.
     - `values`, `label`: a number for each point that colours it, and what it is; all of one `color`
       without.
-    - `most`: how many points are drawn; of more, every so-manieth.
+    - `most`: how many points are drawn; larger sets are subsampled evenly.
 
     **Returns:** the axes: in space, then y over x, z over x, z over y.
     """

@@ -1,0 +1,120 @@
+"""The table of quantities, the energy, and everything along an arm from one program."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vsr_jax as vsr
+from vsr_jax.solution import QUANTITIES, quantity
+
+LENGTH = 0.3
+MODEL = vsr.StrainDependent(8)
+INPUTS = jnp.array([2.0, -0.004, 1.0])
+
+
+def arm(loads=(), weight=9.81):
+    """Tendons by tension, by the length of an elastic cable, and a thread, under dead loads."""
+    rod = vsr.Rod(
+        LENGTH,
+        vsr.Circular(0.01),
+        vsr.Material(1e6, poisson=0.45, density=1000.0),
+        rest_strain=(0.2, 0.5, -0.4, 1.0, 0.0, 0.0),
+        base=vsr.se3.exp(jnp.array([0.1, 0.2, 0.3, 0.02, -0.01, 0.1])),
+    )
+    threads = [
+        vsr.Tendon(vsr.Helix(0.007, pitch=0.4)),
+        vsr.Tendon(vsr.Parallel(0.007, 0.0), control="length", stiffness=2e3),
+        vsr.Thread(vsr.Parallel(0.0, 0.006), end=0.2),
+    ]
+    return vsr.Scene(rod, threads, [vsr.Gravity((0.0, 0.0, -weight)), *loads])
+
+
+@pytest.fixture(scope="module")
+def solved():
+    """The equilibrium and the slopes of its energy by the inputs, the weight and a tip force."""
+
+    @jax.jit
+    def slopes(inputs, weight, force):
+        def total(inputs, weight, force):
+            tip = [vsr.TipWrench(force=force)]
+            eq = vsr.solve(arm(tip, weight), inputs, model=MODEL)
+            return eq.energy.total, eq
+
+        return jax.grad(total, (0, 1, 2), has_aux=True)(inputs, weight, force)
+
+    return slopes(INPUTS, jnp.array(9.81), jnp.array([0.02, 0.1, -0.05]))
+
+
+def test_the_energy_is_stationary(solved):
+    r"""By the envelope theorem $d\Pi / d\tau_i = -l_i$, $d\Pi / dT = l$, $d\Pi / dF = -r(L)$; by
+    the weight the moment of the arm's mass; by a given length the tension, less what is stored in
+    the cable that is added. The error is that of eight steps."""
+    (by_inputs, by_weight, by_force), eq = solved
+    assert bool(eq.converged)
+    assert float(eq.slack[1]) == 0.0
+    # of a stretched cable of free length s the energy T^2 s / (2 k) has its own derivative by s
+    own = float(eq.forces[1]) ** 2 / (2 * 2e3)
+    np.testing.assert_allclose(by_inputs[0], eq.lengths[0], rtol=1e-6)
+    np.testing.assert_allclose(by_inputs[1], eq.forces[1] - own, rtol=1e-6)
+    np.testing.assert_allclose(by_inputs[2], -eq.lengths[2], rtol=1e-6)
+    np.testing.assert_allclose(by_force, -eq.tip[:3, 3], atol=1e-7)
+    nodes, weights = np.polynomial.legendre.leggauss(40)
+    height = eq.position(LENGTH * (nodes + 1) / 2)[:, 2]
+    mass = 1000.0 * np.pi * 0.01**2 * LENGTH
+    np.testing.assert_allclose(by_weight, mass * np.sum(weights * height) / 2, atol=1e-7 * mass)
+
+
+def test_a_summary_is_what_the_attributes_are(solved):
+    eq = solved[1]
+    X = jnp.array([0.0, 0.1, 0.2, 0.3])
+    found = eq.summary(X, ("tip", "lengths", "stability", "energy"))
+    for name in ("pose", "position", "strain", "curvature", "reaction"):
+        np.testing.assert_allclose(getattr(found, name), getattr(eq, name)(X), atol=1e-13)
+    for name in ("tip", "lengths", "stability"):
+        np.testing.assert_allclose(found.values[name], getattr(eq, name), rtol=1e-10)
+    np.testing.assert_allclose(found.threads[0], eq.thread(0, X), atol=1e-13)
+    assert np.isnan(found.threads[2][3]).all()  # this thread ends at 0.2 m
+    around = np.linalg.norm(found.wall - found.position[:, None], axis=-1)
+    np.testing.assert_allclose(around, 0.01, rtol=1e-12)
+    np.testing.assert_allclose(found.curvature, np.hypot(*np.asarray(found.strain)[:, 1:3].T))
+
+
+def test_every_entry_says_what_it_is():
+    for name, entry in QUANTITIES.items():
+        assert entry.name == name
+        assert entry.unit
+        assert len(entry.description) > 10
+
+
+def test_a_new_quantity_is_one_entry(solved):
+    eq = solved[1]
+    try:
+
+        @quantity("m")
+        def height(eq):
+            """Height of the tip above the base [m]."""
+            return eq.tip[2, 3] - eq.scene.rod.base[2, 3]
+
+        assert eq.value("height") == eq.tip[2, 3] - eq.scene.rod.base[2, 3]
+        assert eq.summary(jnp.zeros(1), ["height"]).height == eq.value("height")
+        swept = vsr.sweep(eq.scene, INPUTS[None], outputs="height", model=MODEL, progress=False)
+        np.testing.assert_allclose(swept["height"], [eq.value("height")], rtol=1e-12)
+        with pytest.raises(ValueError, match="quantity: got 'tip', need a name that the table"):
+            quantity("1")(type("tip", (), {"__call__": lambda eq: 0, "__name__": "tip"})())
+    finally:
+        QUANTITIES.pop("height", None)
+    with pytest.raises(ValueError, match="name: got 'height', need one of tip, pose"):
+        eq.value("height")
+
+
+def test_a_failed_solve_has_no_energy():
+    eq = vsr.solve(arm(), [1e300, -0.004, 1.0], model=MODEL)
+    assert np.isnan(eq.energy).all()
+    assert np.isnan(eq.summary(3).curvature).all()
+
+
+def test_an_equilibrium_prints_what_a_person_asks_first(solved):
+    text = str(solved[1])
+    for part in ("converged", "float64", "tip", "estimated error", "stability margin"):
+        assert part in text

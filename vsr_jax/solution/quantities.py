@@ -1,0 +1,199 @@
+"""The table of what can be asked of an equilibrium: name, unit, dimensions and function of each
+quantity.
+
+`Equilibrium` shows every entry as an attribute; `vsr.sweep`, its store, the reports and the
+documentation read unit, dimensions and description here. A new quantity is one entry:
+
+    @quantity("m")
+    def height(eq):
+        "Height of the tip above the base [m]."
+        return eq.tip[2, 3] - eq.scene.rod.base[2, 3]
+
+    eq.value("height"); vsr.sweep(scene, inputs, outputs="height")
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Generic, TypeVar, overload
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float
+
+from ..arm.scene import Scene
+from ..models.base import Status
+from ..numerics.quadrature import onto
+from ..validation import ROUNDING, on_arm
+
+T = TypeVar("T")
+
+
+class Solved(eqx.Module):
+    """What an entry of the table needs of an equilibrium besides its own function."""
+
+    scene: eqx.AbstractVar[Scene]
+    inputs: eqx.AbstractVar[Float[Array, " inputs"]]
+    status: eqx.AbstractVar[Array]
+
+    @property
+    def converged(self) -> Bool[Array, "..."]:
+        """Whether the result is an equilibrium, balanced to rounding."""
+        return self.status == Status.CONVERGED
+
+    def refuse_batch(self) -> None:
+        """Raises `ValueError` for a batch of equilibria."""
+        if jnp.ndim(self.status) > 0:
+            raise ValueError(
+                f"Equilibrium: got a batch of shape {jnp.shape(self.status)}, need jax.vmap, as "
+                f"in jax.vmap(lambda eq: eq.tip)(eqs)"
+            )
+
+    def value(self, name: str) -> Any:
+        """The quantity of the table with that name, also one that was added to it.
+
+        **Raises:** `ValueError` for a name that the table does not have.
+        """
+        entry = QUANTITIES.get(name)
+        if entry is None:
+            raise ValueError(f"name: got {name!r}, need one of {', '.join(QUANTITIES)}")
+        return entry.__get__(self)
+
+
+class Quantity(Generic[T]):
+    """An entry of the table: a function of an equilibrium, compiled, NaN where the solve failed.
+
+    As an attribute of `Equilibrium` it is the value; called with an equilibrium it is the same.
+
+    **Fields:** `name`; `unit`, "see NAME" where it differs along an axis; `dims`, names of the
+    value's axes, None for a value that is not one array; `description`, the first sentence of the
+    function's docstring.
+    """
+
+    def __init__(self, compute: Callable[..., T], unit: str, dims: tuple[str, ...] | None):
+        self.name, self.unit, self.dims, self.compute = compute.__name__, unit, dims, compute
+        self.__doc__ = compute.__doc__
+        self.description = (
+            " ".join((compute.__doc__ or self.name).split()).split(". ")[0].strip(".")
+        )
+        self._program = eqx.filter_jit(self._masked)
+
+    def _masked(self, eq: Solved) -> T:
+        return jax.tree.map(lambda x: jnp.where(eq.converged, x, jnp.nan), self.compute(eq))
+
+    def __call__(self, eq: Solved) -> T:
+        eq.refuse_batch()
+        return self._program(eq)
+
+    @overload
+    def __get__(self, eq: None, owner: Any = None) -> "Quantity[T]": ...
+    @overload
+    def __get__(self, eq: Solved, owner: Any = None) -> T: ...
+    def __get__(self, eq: Any, owner: Any = None) -> Any:
+        return self if eq is None else self(eq)
+
+
+class AlongArm:
+    """An entry of the table that is a function of abscissas X [m]: one, shape (), or several in a
+    row, which become the first axis of the value. NaN beyond the arm where X is traced.
+
+    **Fields:** as `Quantity`; `dims` without that of the abscissas; `of`, the entry whose value the
+    function takes in place of X, None for a function of X.
+    """
+
+    def __init__(
+        self, compute: Callable[..., Array], unit: str, dims: tuple[str, ...], of: str | None
+    ):
+        self.name, self.unit, self.dims, self.compute = compute.__name__, unit, dims, compute
+        self.__doc__, self.description, self.of = compute.__doc__, _sentence(compute), of
+        self._program = eqx.filter_jit(self.at)
+
+    def at(self, eq: Solved, X: Array) -> Array:
+        """The value at abscissas that are checked."""
+        if self.of is None:
+            return masked_along(eq, X, partial(self.compute, eq))
+        entry = QUANTITIES[self.of]
+        assert isinstance(entry, AlongArm)
+        return self.compute(eq, entry.at(eq, X))
+
+    def __call__(self, eq: Solved, X: ArrayLike) -> Array:
+        return self._program(eq, abscissas(eq, X))
+
+    @overload
+    def __get__(self, eq: None, owner: Any = None) -> "AlongArm": ...
+    @overload
+    def __get__(self, eq: Solved, owner: Any = None) -> Callable[[ArrayLike], Array]: ...
+    def __get__(self, eq: Any, owner: Any = None) -> Any:
+        return self if eq is None else partial(self, eq)
+
+
+def _sentence(compute: Callable) -> str:
+    """First sentence of a docstring."""
+    return " ".join((compute.__doc__ or compute.__name__).split()).split(". ")[0].strip(".")
+
+
+QUANTITIES: dict[str, Quantity[Any] | AlongArm] = {}
+"""The table, by name."""
+
+
+def quantity(unit: str, *dims: str) -> Callable[[Callable[..., T]], Quantity[T]]:
+    """Decorator that puts a function of an equilibrium into the table under its own name.
+
+    **Arguments:** `unit`, "1" for a number without; `dims`: names of the value's axes.
+
+    **Raises:** `ValueError` for a name that the table has already.
+    """
+    return lambda compute: _entered(Quantity(compute, unit, dims))
+
+
+def structure(unit: str) -> Callable[[Callable[..., T]], Quantity[T]]:
+    """`quantity` for a value that is not one array; a sweep cannot store it."""
+    return lambda compute: _entered(Quantity(compute, unit, None))
+
+
+def along_arm(
+    unit: str, *dims: str, of: str | None = None
+) -> Callable[[Callable[..., Array]], AlongArm]:
+    """`quantity` for a function of an equilibrium and abscissas, shape (stations,), with the
+    stations in the value's first axis; `dims` are those of its other axes. With `of`, the name of
+    another entry along the arm, the function takes that entry's value in place of the abscissas."""
+    return lambda compute: _entered(AlongArm(compute, unit, dims, of))
+
+
+Entry = TypeVar("Entry", bound="Quantity[Any] | AlongArm")
+
+
+def _entered(entry: Entry) -> Entry:
+    if entry.name in QUANTITIES:
+        raise ValueError(f"quantity: got {entry.name!r}, need a name that the table does not have")
+    QUANTITIES[entry.name] = entry
+    return entry
+
+
+def abscissas(eq: Solved, X: ArrayLike) -> Array:
+    """Abscissas [m] on the arm, one or several in a row, in the precision of the equilibrium.
+
+    **Raises:** `ValueError` for a batch of equilibria, another shape, and an X beyond the arm where
+    it is known.
+    """
+    eq.refuse_batch()
+    array = jnp.asarray(X, eq.inputs.dtype)
+    if array.ndim > 1:
+        raise ValueError(f"X: got shape {array.shape}, need one abscissa or several in a row")
+    on_arm("X", array, eq.scene.rod.length)
+    return array
+
+
+def masked_along(
+    eq: Solved,
+    X: Array,
+    compute: Callable[[Array], Array],
+    ends: tuple[Any, Any] | None = None,
+) -> Array:
+    """A function of abscissas; NaN beyond the arm, or the ends, and where the solve failed."""
+    length = eq.scene.rod.length
+    x, near = onto(X, *((0.0, length) if ends is None else ends), ROUNDING * length)
+    value = compute(jnp.atleast_1d(x))
+    known = jnp.atleast_1d(near & eq.converged).reshape(-1, *(1,) * (value.ndim - 1))
+    return jnp.where(known, value, jnp.nan).reshape(*X.shape, *value.shape[1:])
