@@ -188,18 +188,22 @@ def test_every_number_batched_at_once_is_the_loop(everything):
 
 
 @pytest.mark.slow
-def test_every_number_may_be_batched_alone():
-    """By tracing: the value and the gradient, with one leaf of the scene batched and the others
-    not."""
+@pytest.mark.parametrize("bit", range(6))
+def test_every_number_may_be_batched_without_any_other(bit):
+    """By tracing, half of the scene's leaves batched: those whose place has a bit, or has it not.
+    Any two leaves differ in a bit, so that each is batched once while the other is not."""
     leaves, tree = jax.tree.flatten(full())
+    assert len(leaves) <= 2**6
 
-    for i, leaf in enumerate(leaves):
+    def value(leaves):
+        return mixture(*jax.tree.unflatten(tree, leaves))
 
-        def value(x, i=i):
-            return mixture(*jax.tree.unflatten(tree, [*leaves[:i], x, *leaves[i + 1 :]]))
-
-        shapes = jax.eval_shape(jax.vmap(jax.value_and_grad(value)), jnp.stack([leaf, leaf]))
-        assert [shape.shape for shape in shapes] == [(2,), (2, *leaf.shape)]
+    for wanted, function in ((1, jax.value_and_grad(value)), (0, value)):
+        batched = [i >> bit & 1 == wanted for i in range(len(leaves))]
+        axes = [0 if along else None for along in batched]
+        stacked = [jnp.stack([x, x]) if b else x for x, b in zip(leaves, batched, strict=True)]
+        shapes = jax.tree.leaves(jax.eval_shape(jax.vmap(function, (axes,)), stacked))
+        assert {shape.shape[0] for shape in shapes} == {2}
 
 
 @pytest.mark.slow
