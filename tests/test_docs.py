@@ -1,0 +1,77 @@
+"""README.md and docs/: the list of public names is complete, links lead to files and headings that
+exist, the quick start prints what it says."""
+
+import pathlib
+import re
+import runpy
+
+import pytest
+
+import vsr_jax as vsr
+
+ROOT = pathlib.Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"]
+PAGES += sorted((ROOT / "docs").glob("*.md"))
+LONGEST_README = 800
+
+
+def read(page):
+    return page.read_text(encoding="utf-8")
+
+
+def without_code(text):
+    return re.sub(r"^```.*?^```$|`[^`\n]*`", "", text, flags=re.MULTILINE | re.DOTALL)
+
+
+def anchors(page):
+    """Anchors of a page's headings, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.+)$", without_code(read(page)), flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def blocks(page, language):
+    return re.findall(rf"^```{language}\n(.*?)^```$", read(page), flags=re.MULTILINE | re.DOTALL)
+
+
+def test_the_list_of_public_names_is_complete():
+    listed = re.findall(r"^\| `(\w+)` \|", read(ROOT / "docs/api.md"), flags=re.MULTILINE)
+    assert sorted(listed) == sorted(vsr.__all__)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page):
+    links = re.findall(r"\]\(([^)\s]+)\)", without_code(read(page)))
+    for link in links:
+        if link.startswith(("http://", "https://")):
+            continue
+        file, _, anchor = link.partition("#")
+        target = (page.parent / file).resolve() if file else page
+        assert target.is_relative_to(ROOT), link
+        assert target.exists(), link
+        assert not anchor or anchor in anchors(target), link
+
+
+def test_every_page_is_linked_from_the_readme():
+    linked = {link.split("#")[0] for link in re.findall(r"\]\(([^)]+)\)", read(ROOT / "README.md"))}
+    assert {f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md")} <= linked
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_names_in_the_text_exist(page):
+    """`vsr.solve` and the like, in the text and in code."""
+    names = set(re.findall(r"\bvsr\.([a-zA-Z]\w*)", read(page)))
+    # the changelog names what is no more
+    assert page.name == "CHANGELOG.md" or names <= set(vsr.__all__)
+
+
+def test_the_readme_is_short():
+    assert len(read(ROOT / "README.md").split()) < LONGEST_README
+
+
+def test_the_quick_start_prints_what_it_says(tmp_path, capsys):
+    page = ROOT / "README.md"
+    (code,), (output,) = blocks(page, "python"), blocks(page, "text")
+    file = tmp_path / "quick_start.py"
+    file.write_text(code, encoding="utf-8")
+    runpy.run_path(str(file))
+    assert capsys.readouterr().out == output
