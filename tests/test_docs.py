@@ -8,6 +8,7 @@ import runpy
 import pytest
 
 import vsr_jax as vsr
+from vsr_jax.solution.quantities import QUANTITIES, AlongArm
 
 ROOT = pathlib.Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"]
@@ -36,6 +37,16 @@ def blocks(page, language):
 def test_the_list_of_public_names_is_complete():
     listed = re.findall(r"^\| `(\w+)` \|", read(ROOT / "docs/api.md"), flags=re.MULTILINE)
     assert sorted(listed) == sorted(vsr.__all__)
+
+
+def test_the_list_of_quantities_is_the_table():
+    rows = [
+        f"| `eq.{name}{'(X)' if isinstance(entry, AlongArm) else ''}` | {entry.unit} "
+        f"| {entry.description} |"
+        for name, entry in QUANTITIES.items()
+    ]
+    text = read(ROOT / "docs/api.md")
+    assert [line for line in text.splitlines() if line.startswith("| `eq.")] == rows
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

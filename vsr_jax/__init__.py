@@ -70,7 +70,7 @@ from .models import (
 )
 from .numerics import se3, step_twist, zanna_step
 from .optimization import constraint, objective
-from .solution import Equilibrium, Error, Plan, SolveError, plan, solve
+from .solution import Energy, Equilibrium, Error, Plan, SolveError, Summary, plan, solve
 
 if TYPE_CHECKING:
     from .models.continuum import Continuum
@@ -92,6 +92,7 @@ __all__ = [
     "DistributedWrench",
     "Ellipsoid",
     "Elliptic",
+    "Energy",
     "Equilibrium",
     "Error",
     "Function",
@@ -126,6 +127,7 @@ __all__ = [
     "SplineProfile",
     "Status",
     "StrainDependent",
+    "Summary",
     "Sweep",
     "Taper",
     "Tendon",

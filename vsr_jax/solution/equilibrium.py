@@ -95,7 +95,7 @@ class Equilibrium(Solved):
         """Position $r(X)$ [m] of the axis."""
         return pose[..., :3, 3]
 
-    @along_arm("see strain_units", "strain")
+    @along_arm("1/m and 1", "strain")
     def strain(self, X: Array) -> Float[Array, "stations 6"]:
         r"""Strain $\xi(X) = (k\,[1/m], u\,[-])$."""
         return c.join(self.model.strain(self.scene, self.sound_forces, self.state, X))
@@ -105,10 +105,10 @@ class Equilibrium(Solved):
         r"""Curvature by bending, $\kappa(X) = \sqrt{k_y^2 + k_z^2}$ [1/m]."""
         return c.norm(c.split(strain[..., 1:3]))
 
-    @along_arm("see wrench_units", "wrench")
+    @along_arm("N m and N", "wrench")
     def reaction(self, X: Array) -> Float[Array, "stations 6"]:
-        r"""Wrench $\Lambda(X) = (M\,[N m], N\,[N])$ in the body frame by which rod and threads
-        together carry the loads beyond X."""
+        r"""Internal wrench $\Lambda(X) = (M, N)$ in the body frame that balances the loads beyond
+        X. Rod and threads carry it together."""
         nodes = self.nodes
         loads = loading(self.scene, nodes.grid)
         if loads is None:
@@ -162,7 +162,7 @@ class Equilibrium(Solved):
 
     @quantity("m", "actuator")
     def lengths(self) -> Float[Array, " threads"]:
-        """Length of each thread's path, $l_i = \\int |t_{ci}| dX$ [m]."""
+        r"""Length of each thread's path [m], $l_i = \int \lVert t_{ci} \rVert dX$."""
         nodes, places = self.nodes, range(len(self.scene.actuators))
         lengths = [path_length(nodes.xi, nodes.sections, i, nodes.grid) for i in places]
         return jnp.array(lengths, self.inputs.dtype)
@@ -175,8 +175,8 @@ class Equilibrium(Solved):
 
     @quantity("m", "actuator")
     def slack(self) -> Float[Array, " threads"]:
-        """Length of cable [m] that hangs loose in each tendon driven by its length; zero while it
-        is taut, and for all others."""
+        """Slack of each tendon that is driven by its length [m]. Zero while it is taut, and for all
+        other threads."""
         nodes, scene = self.nodes, self.scene
         slack = jnp.zeros_like(self.inputs)
         for place in scene.length_driven:
@@ -189,8 +189,8 @@ class Equilibrium(Solved):
 
     @quantity("see dof_units", "dof")
     def q(self) -> Float[Array, " dofs"]:
-        """Coordinates of the strain in the model's basis: those of `Prescribed`, the thread forces
-        (eq. 20) for `StrainDependent`."""
+        """Coordinates of the strain in the model's basis. For `StrainDependent` they are the thread
+        forces (eq. 20)."""
         return self.model.coordinates(self.scene, self.sound_forces, self.state)
 
     def thread(self, index: int, X: ArrayLike) -> Float[Array, "... 3"]:
