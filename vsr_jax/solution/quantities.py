@@ -7,7 +7,7 @@ documentation read unit, dimensions and description here. A new quantity is one 
     @quantity("m")
     def height(eq):
         "Height of the tip above the base [m]."
-        return eq.tip[2, 3] - eq.scene.rod.base[2, 3]
+        return eq.tip[2, 3] - eq.position(0.0)[2]
 
     eq.value("height"); vsr.sweep(scene, inputs, outputs="height")
 """
