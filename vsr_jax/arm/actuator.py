@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool
 
 from ..typing import Scalar
 from ..validation import choice, concrete, instance, numbers
+from .fields import in_unit
 from .routing import Routing
 
 
@@ -84,8 +85,8 @@ class Thread(Actuator):
     fluidic chamber."""
 
     routing: Routing
-    start: Scalar | None
-    end: Scalar | None
+    start: Scalar | None = in_unit("m")
+    end: Scalar | None = in_unit("m")
     effect = "threads"
 
     def __init__(self, routing: Routing, *, start: Any = None, end: Any = None):
@@ -127,10 +128,10 @@ class Tendon(Actuator):
     """
 
     routing: Routing
-    start: Scalar | None
-    end: Scalar | None
-    stiffness: Scalar | None
-    friction: Scalar | None
+    start: Scalar | None = in_unit("m")
+    end: Scalar | None = in_unit("m")
+    stiffness: Scalar | None = in_unit("N")
+    friction: Scalar | None = in_unit("-")
     control: Literal["tension", "length"] = eqx.field(static=True)
     motion: Literal["pull", "release"] = eqx.field(static=True)
     effect = "tendons"
@@ -184,9 +185,9 @@ class Chamber(Actuator):
     """
 
     routing: Routing
-    area: Scalar
-    start: Scalar | None
-    end: Scalar | None
+    area: Scalar = in_unit("m^2")
+    start: Scalar | None = in_unit("m")
+    end: Scalar | None = in_unit("m")
     effect = "chambers"
 
     def __init__(self, routing: Routing, area: Any, *, start: Any = None, end: Any = None):

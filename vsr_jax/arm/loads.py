@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from ..numerics.component import Vector, split
 from ..typing import Scalar
 from ..validation import choice, numbers
+from .fields import in_unit
 from .profile import FunctionOfX, Profile, as_profile
 from .rod import Rod
 
@@ -56,8 +57,8 @@ class Gravity(Load):
     The rod's material needs a `density`.
     """
 
-    acceleration: Float[Array, "3"]
-    fluid_density: Scalar | None
+    acceleration: Float[Array, "3"] = in_unit("m/s^2")
+    fluid_density: Scalar | None = in_unit("kg/m^3")
     frame: Frame = eqx.field(static=True, default="world", init=False)
     effect = "gravity"
 
@@ -89,9 +90,9 @@ class PointWrench(Load):
     - `frame`: `"world"` for a dead wrench, `"body"` for one that follows the section.
     """
 
-    X: Scalar
-    force: Float[Array, "3"]
-    moment: Float[Array, "3"]
+    X: Scalar = in_unit("m")
+    force: Float[Array, "3"] = in_unit("N")
+    moment: Float[Array, "3"] = in_unit("N m")
     frame: Frame = eqx.field(static=True)
     effect = "point wrench"
 
@@ -117,8 +118,8 @@ class PointWrench(Load):
 class TipWrench(Load):
     """A force and a moment on the arm's end; arguments as for `PointWrench`."""
 
-    force: Float[Array, "3"]
-    moment: Float[Array, "3"]
+    force: Float[Array, "3"] = in_unit("N")
+    moment: Float[Array, "3"] = in_unit("N m")
     frame: Frame = eqx.field(static=True)
     effect = "tip wrench"
 
@@ -142,8 +143,8 @@ class DistributedWrench(Load):
     - `frame`: `"world"` for a dead load, `"body"` for one that follows the sections.
     """
 
-    force: tuple[Profile, ...] | FunctionOfX
-    moment: tuple[Profile, ...] | FunctionOfX
+    force: tuple[Profile, ...] | FunctionOfX = in_unit("N/m")
+    moment: tuple[Profile, ...] | FunctionOfX = in_unit("N")
     frame: Frame = eqx.field(static=True)
     effect = "distributed wrench"
 

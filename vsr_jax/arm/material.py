@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 from ..numerics.component import Vector
 from ..typing import Scalar
+from .fields import in_unit
 from .profile import Limits, Profile, as_profile
 from .section import Section
 
@@ -26,10 +27,10 @@ class Material(eqx.Module):
     - `density`: $\\rho$ [kg/m^3], needed by `Gravity` only.
     """
 
-    young: Profile
-    shear: Profile | None
-    poisson: Profile | None
-    density: Profile | None
+    young: Profile = in_unit("Pa")
+    shear: Profile | None = in_unit("Pa")
+    poisson: Profile | None = in_unit("-")
+    density: Profile | None = in_unit("kg/m^3")
 
     def __init__(self, young: Any, shear: Any = None, poisson: Any = None, density: Any = None):
         if (shear is None) == (poisson is None):

@@ -14,11 +14,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float
 
 from ..typing import Scalar
 from ..validation import concrete, numbers
+from .fields import OF_OWNER, in_unit
+from .spline import spline_breakpoints, spline_points, spline_value
 
 Limits = dict[tuple[str, str], tuple[Array, Array]]
 """Numbers that have limits, by their name and by what is needed of them; each with its room, how
@@ -67,7 +68,7 @@ class Profile(eqx.Module):
 class Constant(Profile):
     """$f(X) = c$."""
 
-    value: Scalar
+    value: Scalar = in_unit(OF_OWNER, named=False)
 
     def __init__(self, value: Any):
         self.value = numbers("Constant.value", value)
@@ -79,8 +80,8 @@ class Constant(Profile):
 class Taper(Profile):
     """$f(X) = f_b + (f_t - f_b) X / L$: from `base` at X = 0 to `tip` at X = L."""
 
-    base: Scalar
-    tip: Scalar
+    base: Scalar = in_unit(OF_OWNER)
+    tip: Scalar = in_unit(OF_OWNER)
 
     def __init__(self, base: Any, tip: Any):
         self.base = numbers("Taper.base", base)
@@ -93,98 +94,32 @@ class Taper(Profile):
 class PolynomialProfile(Profile):
     """$f(X) = \\sum_i c_i X^i$, `coefficients` in rising order, units of $f$ per m^i."""
 
-    coefficients: Float[Array, " terms"]
+    coefficients: Float[Array, " terms"] = in_unit(OF_OWNER, powers=True)
 
     def __init__(self, coefficients: Any):
-        self.coefficients = numbers("PolynomialProfile.coefficients", coefficients, None)
-        if self.coefficients.ndim != 1 or self.coefficients.size == 0:
-            raise ValueError(
-                f"PolynomialProfile.coefficients: got shape {self.coefficients.shape}, need at "
-                f"least one number in a row"
-            )
+        self.coefficients = rising_coefficients("PolynomialProfile.coefficients", coefficients)
 
     def __call__(self, X: Scalar, length: Scalar) -> Scalar:
         return jnp.polyval(self.coefficients[::-1], X)
 
 
 class SplineProfile(Profile):
-    """Cubic not-a-knot spline through `values` at the abscissas `X` [m].
+    """Cubic not-a-knot spline through `values` at the abscissas `X` [m], see
+    `spline_value`."""
 
-    Two points give the straight line and three the parabola through them. Beyond the first and last
-    point the end pieces go on. **Source:** C. de Boor, A Practical Guide to Splines, ch. IV.
-    """
-
-    X: Float[Array, " points"]
-    values: Float[Array, " points"]
+    X: Float[Array, " points"] = in_unit("m")
+    values: Float[Array, " points"] = in_unit(OF_OWNER)
 
     def __init__(self, X: Any, values: Any):
-        self.X = numbers("SplineProfile.X", X, None)
+        self.X = spline_points("SplineProfile.X", X)
         self.values = numbers("SplineProfile.values", values, self.X.shape)
-        if self.X.ndim != 1 or self.X.size < 2:
-            raise ValueError(
-                f"SplineProfile.X: got shape {self.X.shape}, need at least two abscissas in a row"
-            )
-        known = concrete(self.X)
-        if known is not None and not np.all(np.diff(known) > 0):
-            raise ValueError(f"SplineProfile.X: got {known.tolist()}, need rising abscissas")
 
     @property
     def breakpoints(self) -> tuple[Scalar, ...]:
-        return tuple(self.X[i] for i in range(2, self.X.size - 2))
-
-    def _slopes(self) -> Float[Array, " points"]:
-        x, h = self.X, jnp.diff(self.X)
-        secant = jnp.diff(self.values) / h
-        n = x.size
-        if n == 2:
-            return jnp.stack([secant[0], secant[0]])
-        if n == 3:
-            second = (secant[1] - secant[0]) / (x[2] - x[0])
-            return jnp.stack(
-                [secant[0] - second * h[0], secant[0] + second * h[0], secant[1] + second * h[1]]
-            )
-        inner = 3 * (h[1:] * secant[:-1] + h[:-1] * secant[1:])
-        ends = []
-        for (p, q), (s, t) in ((h[:2], secant[:2]), (h[-2:][::-1], secant[-2:][::-1])):
-            ends.append((q, p + q, ((p + 2 * (p + q)) * q * s + p**2 * t) / (p + q)))
-        (first, above, start), (last, below, end) = ends
-        lower = jnp.concatenate([jnp.zeros(1, x.dtype), h[1:], below[None]])
-        diagonal = jnp.concatenate([first[None], 2 * (h[:-1] + h[1:]), last[None]])
-        upper = jnp.concatenate([above[None], h[:-1], jnp.zeros(1, x.dtype)])
-        return _tridiagonal(
-            lower, diagonal, upper, jnp.concatenate([start[None], inner, end[None]])
-        )
+        return spline_breakpoints(self.X)
 
     def __call__(self, X: Scalar, length: Scalar) -> Scalar:
-        slopes = self._slopes()
-        i = jnp.clip(jnp.searchsorted(self.X, X, side="right") - 1, 0, self.X.size - 2)
-        h = self.X[i + 1] - self.X[i]
-        s = (X - self.X[i]) / h
-        secant = (self.values[i + 1] - self.values[i]) / h
-        d0, d1 = slopes[i], slopes[i + 1]
-        return self.values[i] + h * s * (
-            d0 + s * ((3 * secant - 2 * d0 - d1) + s * (d0 + d1 - 2 * secant))
-        )
-
-
-def _tridiagonal(lower: Array, diagonal: Array, upper: Array, right: Array) -> Array:
-    """Solution by elimination without pivots, whose order the rows of a spline do not need."""
-
-    def down(
-        above: tuple[Array, Array], row: tuple[Array, Array, Array, Array]
-    ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        (ratio, value), (left, middle, beyond, side) = above, row
-        pivot = middle - left * ratio
-        here = beyond / pivot, (side - left * value) / pivot
-        return here, here
-
-    def up(after: Array, row: tuple[Array, Array]) -> tuple[Array, Array]:
-        here = row[1] - row[0] * after
-        return here, here
-
-    zero = jnp.zeros((), right.dtype)
-    _, rows = lax.scan(down, (zero, zero), (lower, diagonal, upper, right))
-    return lax.scan(up, zero, rows, reverse=True)[1]
+        return spline_value(X, self.X, self.values)
 
 
 class Piecewise(Profile):
@@ -196,8 +131,8 @@ class Piecewise(Profile):
       of X on the whole arm.
     """
 
-    ends: Float[Array, " inner"]
-    values: tuple[Profile, ...]
+    ends: Float[Array, " inner"] = in_unit("m")
+    values: tuple[Profile, ...] = in_unit(OF_OWNER)
 
     def __init__(self, ends: Any, values: Sequence[Any]):
         self.ends = rising_ends("Piecewise", ends, values)
@@ -214,6 +149,14 @@ class Piecewise(Profile):
             *(end for end in self.ends),
             *(x for value in self.values for x in value.breakpoints),
         )
+
+
+def rising_coefficients(name: str, value: Any) -> Float[Array, " terms"]:
+    """`value` as the coefficients of a polynomial, at least one."""
+    array = numbers(name, value, None)
+    if array.ndim != 1 or array.size == 0:
+        raise ValueError(f"{name}: got shape {array.shape}, need at least one number in a row")
+    return array
 
 
 def rising_ends(owner: str, ends: Any, parts: Sequence[Any]) -> Float[Array, " inner"]:
@@ -256,7 +199,7 @@ class _Scaled(Profile):
     """A factor times a profile."""
 
     factor: float = eqx.field(static=True)
-    profile: Profile
+    profile: Profile = in_unit(OF_OWNER)
 
     def __call__(self, X: Scalar, length: Scalar) -> Scalar:
         return self.factor * self.profile(X, length)

@@ -11,6 +11,7 @@ from jaxtyping import Array
 from ..numerics.component import Vector, norm
 from ..typing import Pose, Scalar
 from ..validation import instance, numbers, rigid
+from .fields import in_unit
 from .material import Material
 from .profile import FunctionOfX, Limits, Profile, as_profile
 from .section import Section
@@ -18,7 +19,8 @@ from .section import Section
 STRAINS = ("torsion", "bending_y", "bending_z", "elongation", "shear_y", "shear_z")
 """Names of the six strains $(k_x, k_y, k_z, u_x, u_y, u_z)$ in order."""
 
-_STRAIGHT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
+STRAIGHT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
+"""Strains of a straight rod without shear, stretch and twist."""
 
 
 class Rod(eqx.Module):
@@ -36,12 +38,12 @@ class Rod(eqx.Module):
       default they run inside the section.
     """
 
-    length: Scalar
+    length: Scalar = in_unit("m")
     section: Section
     material: Material
-    rest_strain: tuple[Profile, ...] | FunctionOfX
-    base: Pose | None
-    guide_radius: Scalar | None
+    rest_strain: tuple[Profile, ...] | FunctionOfX = in_unit(("1/m",) * 3 + ("-",) * 3)
+    base: Pose | None = in_unit("-")
+    guide_radius: Scalar | None = in_unit("m")
 
     def __init__(
         self,
@@ -49,7 +51,7 @@ class Rod(eqx.Module):
         section: Section,
         material: Material,
         *,
-        rest_strain: Sequence[Any] | Callable | None = None,
+        rest_strain: Sequence[Any] | Callable | None = STRAIGHT,
         base: Any = None,
         guide_radius: Any = None,
     ):
@@ -122,7 +124,7 @@ class Rod(eqx.Module):
 
 def _rest_strain(value: Any) -> tuple[Profile, ...] | FunctionOfX:
     if value is None:
-        value = _STRAIGHT
+        value = STRAIGHT
     if isinstance(value, FunctionOfX):
         return value
     if callable(value):

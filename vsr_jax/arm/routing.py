@@ -13,12 +13,14 @@ from typing import Any, Literal, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from ..numerics.component import Vector
 from ..typing import Scalar
 from ..validation import choice, numbers
-from .profile import FunctionOfX, PolynomialProfile, SplineProfile
+from .fields import in_unit
+from .profile import FunctionOfX, rising_coefficients
+from .spline import spline_breakpoints, spline_points, spline_value
 
 
 class Path(NamedTuple):
@@ -62,8 +64,8 @@ class Routing(eqx.Module):
 class Parallel(Routing):
     """Parallel to the axis: $d = (0, y, z)$, in metres."""
 
-    y: Scalar
-    z: Scalar
+    y: Scalar = in_unit("m")
+    z: Scalar = in_unit("m")
 
     def __init__(self, y: Any, z: Any):
         self.y = numbers("Parallel.y", y)
@@ -77,10 +79,10 @@ class Linear(Routing):
     """Straight and oblique (eq. 22): $d = (0, y + \\bar y X, z + \\bar z X)$, slopes $\\bar y,
     \\bar z$ without unit."""
 
-    y: Scalar
-    z: Scalar
-    slope_y: Scalar
-    slope_z: Scalar
+    y: Scalar = in_unit("m")
+    z: Scalar = in_unit("m")
+    slope_y: Scalar = in_unit("-")
+    slope_z: Scalar = in_unit("-")
 
     def __init__(self, y: Any, z: Any, slope_y: Any = 0.0, slope_z: Any = 0.0):
         self.y = numbers("Linear.y", y)
@@ -104,10 +106,10 @@ class Helix(Routing):
     - `hand`: `"right"` winds from y towards z along the arm, `"left"` the other way.
     """
 
-    radius: Scalar
-    angle: Scalar | None
-    pitch: Scalar | None
-    phase: Scalar
+    radius: Scalar = in_unit("m")
+    angle: Scalar | None = in_unit("rad")
+    pitch: Scalar | None = in_unit("m")
+    phase: Scalar = in_unit("rad")
     hand: Literal["right", "left"] = eqx.field(static=True)
 
     def __init__(
@@ -146,34 +148,35 @@ class Polynomial(Routing):
     """Polynomial path: $d_y = \\sum_i y_i X^i$, $d_z = \\sum_i z_i X^i$, coefficients in rising
     order [m^(1-i)]."""
 
-    y: PolynomialProfile
-    z: PolynomialProfile
+    y: Float[Array, " terms_y"] = in_unit("m", powers=True)
+    z: Float[Array, " terms_z"] = in_unit("m", powers=True)
 
     def __init__(self, y: Any, z: Any):
-        self.y = PolynomialProfile(numbers("Polynomial.y", y, None))
-        self.z = PolynomialProfile(numbers("Polynomial.z", z, None))
+        self.y = rising_coefficients("Polynomial.y", y)
+        self.z = rising_coefficients("Polynomial.z", z)
 
     def __call__(self, X: Scalar) -> tuple[Scalar, Scalar]:
-        return self.y(X, X), self.z(X, X)
+        return jnp.polyval(self.y[::-1], X), jnp.polyval(self.z[::-1], X)
 
 
 class Spline(Routing):
     """Cubic not-a-knot spline through the points (X, y, z), in metres, at least two."""
 
-    y: SplineProfile
-    z: SplineProfile
+    X: Float[Array, " points"] = in_unit("m")
+    y: Float[Array, " points"] = in_unit("m")
+    z: Float[Array, " points"] = in_unit("m")
 
     def __init__(self, X: Any, y: Any, z: Any):
-        knots = numbers("Spline.X", X, None)
-        self.y = SplineProfile(knots, numbers("Spline.y", y, knots.shape))
-        self.z = SplineProfile(knots, numbers("Spline.z", z, knots.shape))
+        self.X = spline_points("Spline.X", X)
+        self.y = numbers("Spline.y", y, self.X.shape)
+        self.z = numbers("Spline.z", z, self.X.shape)
 
     def __call__(self, X: Scalar) -> tuple[Scalar, Scalar]:
-        return self.y(X, X), self.z(X, X)
+        return spline_value(X, self.X, self.y), spline_value(X, self.X, self.z)
 
     @property
     def breakpoints(self) -> tuple[Scalar, ...]:
-        return self.y.breakpoints
+        return spline_breakpoints(self.X)
 
 
 class Function(Routing):

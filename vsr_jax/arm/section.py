@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from ..numerics.component import norm
 from ..typing import Scalar
 from ..validation import choice, concrete, instance, numbers
+from .fields import in_unit
 from .profile import Constant, Limits, Profile, as_profile, pick, rising_ends, scaled
 
 Torsion = Literal["saint_venant", "polar"]
@@ -25,11 +26,11 @@ class Geometry(eqx.Module):
     """Area [m^2], second moments about y and z and torsion constant [m^4], and shear factors [-] of
     one cross-section."""
 
-    area: Scalar
-    moment_y: Scalar
-    moment_z: Scalar
-    torsion: Scalar
-    shear_factors: Float[Array, "2"]
+    area: Scalar = in_unit("m^2")
+    moment_y: Scalar = in_unit("m^4")
+    moment_z: Scalar = in_unit("m^4")
+    torsion: Scalar = in_unit("m^4")
+    shear_factors: Float[Array, "2"] = in_unit("-")
 
 
 class Section(eqx.Module):
@@ -88,9 +89,9 @@ class Circular(Section):
     **Arguments:** `radius` or `diameter` [m], one of the two; the radius is what is kept.
     """
 
-    radius: Profile
+    radius: Profile = in_unit("m")
     torsion: Torsion = eqx.field(static=True)
-    shear_correction: Float[Array, "2"]
+    shear_correction: Float[Array, "2"] = in_unit("-")
 
     def __init__(self, radius: Any = None, *, diameter: Any = None, shear_correction: Any = 1.0):
         if (radius is None) == (diameter is None):
@@ -125,10 +126,10 @@ class Annular(Section):
     """Tube of radii $r < R$: $A = \\pi (R^2 - r^2)$, $J_y = J_z = \\pi (R^4 - r^4) / 4$, $J_x = 2
     J_y$."""
 
-    outer: Profile
-    inner: Profile
+    outer: Profile = in_unit("m")
+    inner: Profile = in_unit("m")
     torsion: Torsion = eqx.field(static=True)
-    shear_correction: Float[Array, "2"]
+    shear_correction: Float[Array, "2"] = in_unit("-")
 
     def __init__(self, outer: Any, inner: Any, *, shear_correction: Any = 1.0):
         self.outer = _size("Annular", "outer", outer)
@@ -178,10 +179,10 @@ class Rectangular(Section):
     Goodier, Theory of Elasticity, art. 109.
     """
 
-    width: Profile
-    height: Profile
+    width: Profile = in_unit("m")
+    height: Profile = in_unit("m")
     torsion: Torsion = eqx.field(static=True)
-    shear_correction: Float[Array, "2"]
+    shear_correction: Float[Array, "2"] = in_unit("-")
 
     def __init__(
         self,
@@ -236,10 +237,10 @@ class Elliptic(Section):
     a^3 b^3}{a^2 + b^2}$.
     """
 
-    semi_axis_y: Profile
-    semi_axis_z: Profile
+    semi_axis_y: Profile = in_unit("m")
+    semi_axis_z: Profile = in_unit("m")
     torsion: Torsion = eqx.field(static=True)
-    shear_correction: Float[Array, "2"]
+    shear_correction: Float[Array, "2"] = in_unit("-")
 
     def __init__(
         self,
@@ -285,7 +286,7 @@ class Joined(Section):
     - `sections`: one more than `ends`, of any shapes.
     """
 
-    ends: Float[Array, " inner"]
+    ends: Float[Array, " inner"] = in_unit("m")
     sections: tuple[Section, ...]
 
     def __init__(self, ends: Any, sections: Sequence[Section]):

@@ -5,8 +5,8 @@ The top of a file holds the arguments of `Scene` and, if wanted, a `title` and t
 Arguments keep the units of the constructors. Where only one class can stand (`rod`, `material`) the
 type may be left out, and where a profile is expected a plain number will do.
 
-To teach the files a new class, add it to its group below; the arguments are read off its
-constructor and, for writing, off the attributes of the same names.
+A new class needs an entry in its group below and a field for each argument of its constructor, of
+the same name. An argument without a field is read but not written, as `diameter` of `Circular`.
 """
 
 import difflib
@@ -14,7 +14,6 @@ import inspect
 import re
 import tomllib
 import uuid
-from operator import attrgetter
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,6 +23,7 @@ import tomli_w
 from jaxtyping import Array, Float
 
 from ..arm.actuator import Chamber, Tendon, Thread
+from ..arm.fields import arguments
 from ..arm.loads import DistributedWrench, Gravity, PointWrench, TipWrench
 from ..arm.material import Material
 from ..arm.profile import Constant, Piecewise, PolynomialProfile, SplineProfile, Taper
@@ -52,21 +52,6 @@ _GROUPS = {
     "loads": _group(Gravity, TipWrench, PointWrench, DistributedWrench),
 }
 """Which classes can stand under a key; profiles under every other."""
-
-_STORED_AS = {
-    (Polynomial, "y"): "y.coefficients",
-    (Polynomial, "z"): "z.coefficients",
-    (Spline, "X"): "y.X",
-    (Spline, "y"): "y.values",
-    (Spline, "z"): "z.values",
-}
-"""Arguments kept in another attribute than the one of their name."""
-
-_NOT_STORED = ((Circular, "diameter"),)
-"""Arguments that say in another way what is stored under another name."""
-
-_DEFAULTS = {(Rod, "rest_strain"): (0.0, 0.0, 0.0, 1.0, 0.0, 0.0)}
-"""What a default of None stands for."""
 
 _FILE_KEYS = ("title", "inputs")
 _SHORT_LIST = re.compile(r"\[\n[^][{}]*\]")
@@ -198,12 +183,12 @@ def kind_of(table: dict[str, Any], path: str, group: Group) -> type:
 
 def _build(kind: type, table: dict[str, Any], path: str) -> Any:
     check_keys(kind, table, path)
-    arguments = {
+    given = {
         key: _read(value, _below(path, key), _GROUPS.get(key, _PROFILES))
         for key, value in table.items()
     }
     try:
-        return kind(**arguments)
+        return kind(**given)
     except (ValueError, TypeError, OverflowError) as error:
         raise ValueError(at(path, " ".join(str(error).split()))) from None
 
@@ -238,15 +223,11 @@ def at(path: str, message: str) -> str:
 
 
 def _arguments(value: Any, path: str) -> dict[str, Any]:
-    kind, table = type(value), {}
-    for name, parameter in inspect.signature(kind).parameters.items():
-        if (kind, name) in _NOT_STORED:
-            continue
-        stored = attrgetter(_STORED_AS.get((kind, name), name))(value)
-        if stored is None:
-            continue
-        plain = _write(stored, _below(path, name), _GROUPS.get(name, _PROFILES))
-        if not _same(plain, _DEFAULTS.get((kind, name), parameter.default)):
+    table = {}
+    for argument in arguments(value):
+        name = argument.name
+        plain = _write(argument.value, _below(path, name), _GROUPS.get(name, _PROFILES))
+        if not _same(plain, argument.default):
             table[name] = plain
     return table
 
