@@ -10,11 +10,12 @@ from jaxtyping import Array, Bool
 
 from ..typing import Scalar
 from ..validation import choice, concrete, instance, numbers
+from .description import Part
 from .fields import in_unit
 from .routing import Routing
 
 
-class Actuator(eqx.Module):
+class Actuator(Part):
     """A thread laid along a routing and driven by one input.
 
     **Arguments shared by all:**

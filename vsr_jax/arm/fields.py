@@ -47,13 +47,15 @@ def coefficient_unit(unit: str, power: int) -> str:
 
 
 class Argument(NamedTuple):
-    """An argument of a constructor as the object stores it."""
+    """An argument of a constructor as the object stores it; `unit`, `powers` and `named` as for
+    `in_unit`."""
 
     name: str
     value: Any
     default: Any
     unit: Unit
     powers: bool
+    named: bool
 
 
 def arguments(part: eqx.Module, owner: Unit = "") -> Iterator[Argument]:
@@ -68,5 +70,6 @@ def arguments(part: eqx.Module, owner: Unit = "") -> Iterator[Argument]:
     for name, parameter in inspect.signature(type(part)).parameters.items():
         value = getattr(part, name, None)
         if name in fields and value is not None:
-            unit, powers = unit_of(fields[name], owner), fields[name].metadata.get("powers", False)
-            yield Argument(name, value, parameter.default, unit, powers)
+            unit, metadata = unit_of(fields[name], owner), fields[name].metadata
+            options = metadata.get("powers", False), metadata.get("named", True)
+            yield Argument(name, value, parameter.default, unit, *options)

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from ..numerics.component import Vector, split
 from ..typing import Scalar
 from ..validation import choice, numbers
+from .description import Part
 from .fields import in_unit
 from .profile import FunctionOfX, Profile, as_profile
 from .rod import Rod
@@ -25,7 +26,7 @@ from .rod import Rod
 Frame = Literal["world", "body"]
 
 
-class Load(eqx.Module):
+class Load(Part):
     """A load on the arm: a wrench per length, or a wrench at a point, in the frame it keeps."""
 
     frame: eqx.AbstractVar[Frame]

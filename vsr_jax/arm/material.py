@@ -3,11 +3,11 @@ A, \kappa_y G A, \kappa_z G A)$."""
 
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 
 from ..numerics.component import Vector
 from ..typing import Scalar
+from .description import Part
 from .fields import in_unit
 from .profile import Limits, Profile, as_profile
 from .section import Section
@@ -17,7 +17,7 @@ LEAST_POISSON, MOST_POISSON = -1.0, 0.5
 second."""
 
 
-class Material(eqx.Module):
+class Material(Part):
     """Linear elastic material; its numbers may vary along the arm.
 
     **Arguments**, each a profile (a number, a `Profile` or a function of X):

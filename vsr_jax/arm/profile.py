@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 
 from ..typing import Scalar
 from ..validation import concrete, numbers
+from .description import Part, describe
 from .fields import OF_OWNER, in_unit
 from .spline import spline_breakpoints, spline_points, spline_value
 
@@ -51,8 +52,12 @@ class FunctionOfX(eqx.Module):
         """Whatever the function returns at X [m]."""
         return self.function(X, *self.parameters)
 
+    def __repr__(self) -> str:
+        name = getattr(self.function, "__name__", type(self.function).__name__)
+        return f"{name}({', '.join(('X', *map(describe, self.parameters)))})"
 
-class Profile(eqx.Module):
+
+class Profile(Part):
     """A scalar function of X on an arm of a given length."""
 
     @abstractmethod

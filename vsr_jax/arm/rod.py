@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -11,6 +10,7 @@ from jaxtyping import Array
 from ..numerics.component import Vector, norm
 from ..typing import Pose, Scalar
 from ..validation import instance, numbers, rigid
+from .description import Part
 from .fields import in_unit
 from .material import Material
 from .profile import FunctionOfX, Limits, Profile, as_profile
@@ -23,7 +23,7 @@ STRAIGHT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
 """Strains of a straight rod without shear, stretch and twist."""
 
 
-class Rod(eqx.Module):
+class Rod(Part):
     """A Cosserat rod, clamped at its base.
 
     **Arguments:**

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from ..numerics.component import Vector
 from ..typing import Scalar
 from ..validation import choice, numbers
+from .description import Part
 from .fields import in_unit
 from .profile import FunctionOfX, rising_coefficients
 from .spline import spline_breakpoints, spline_points, spline_value
@@ -43,7 +44,7 @@ def thread_tangent(xi: Vector, path: Path) -> Vector:
     )
 
 
-class Routing(eqx.Module):
+class Routing(Part):
     """The path of one thread through the sections."""
 
     @abstractmethod

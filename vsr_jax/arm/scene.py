@@ -15,6 +15,7 @@ from ..numerics.quadrature import make_grid, piece_edges
 from ..typing import Scalar, cast
 from ..validation import ROUNDING, concrete, instance, is_traced, numbers, precise
 from .actuator import Actuator, Tendon
+from .description import Part, describe, described_arguments, table
 from .loads import Frame, Gravity, Load
 from .profile import Limits
 from .rod import STRAINS, Rod
@@ -41,7 +42,7 @@ def shared(forces: Vector, shares: tuple[Array | None, ...]) -> Vector:
     return tuple(f if share is None else f * share for f, share in zip(forces, shares, strict=True))
 
 
-class Scene(eqx.Module):
+class Scene(Part):
     """A rod, the actuators laid through it and the loads on it. Only what is present is computed.
 
     **Arguments:**
@@ -91,6 +92,18 @@ class Scene(eqx.Module):
                 "Material(..., density=...)"
             )
         self._check_numbers()
+
+    def __repr__(self) -> str:
+        rod = described_arguments(self.rod) if isinstance(self.rod, Part) else []
+        rows = [(f"rod.{name}", text) for name, text in rod] or [("rod", describe(self.rod))]
+        rows += [
+            (f"actuators[{i}]", f"{describe(actuator)}, input in {actuator.unit}")
+            for i, actuator in enumerate(self.actuators)
+        ]
+        rows += [(f"loads[{i}]", describe(load)) for i, load in enumerate(self.loads)]
+        if self.free_strains != STRAINS:
+            rows.append(("free_strains", ", ".join(self.free_strains)))
+        return table("Scene", rows)
 
     @property
     def effects(self) -> tuple[str, ...]:

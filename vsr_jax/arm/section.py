@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from ..numerics.component import norm
 from ..typing import Scalar
 from ..validation import choice, concrete, instance, numbers
+from .description import Part
 from .fields import in_unit
 from .profile import Constant, Limits, Profile, as_profile, pick, rising_ends, scaled
 
@@ -33,7 +34,7 @@ class Geometry(eqx.Module):
     shear_factors: Float[Array, "2"] = in_unit("-")
 
 
-class Section(eqx.Module):
+class Section(Part):
     """A cross-section whose sizes may vary along the arm.
 
     **Arguments shared by the shapes:**
