@@ -124,8 +124,10 @@ def test_any_tree_of_a_scene_has_a_text(leaf):
     assert "rod.section" in repr(jax.tree.map(lambda _: leaf, SCENE))
 
 
-def test_a_part_that_is_missing_has_a_text():
-    assert "rod" in repr(eqx.tree_at(lambda s: s.rod, SCENE, None))
+@pytest.mark.parametrize("name", ["rod", "actuators", "loads"])
+def test_a_part_that_is_missing_has_a_text(name):
+    lines = repr(eqx.tree_at(lambda s: getattr(s, name), SCENE, None)).splitlines()
+    assert f"{name} None" in [" ".join(line.split()) for line in lines]
 
 
 def test_deleted_numbers_have_a_text():

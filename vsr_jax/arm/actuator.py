@@ -39,6 +39,21 @@ class Actuator(Part):
         """The least input it can take."""
         return float("-inf")
 
+    @property
+    def length_driven(self) -> bool:
+        """Whether the input is a change of length, so that the force is an unknown."""
+        return False
+
+    @property
+    def frictional(self) -> bool:
+        """Whether the force decays along the thread."""
+        return False
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """What the actuator adds to `Scene.effects`, its `effect` first."""
+        return (self.effect,)
+
     @abstractmethod
     def force(self, value: Scalar) -> Scalar:
         """Signed thread force $\\tau$ [N] for an input."""
@@ -169,7 +184,24 @@ class Tendon(Actuator):
 
     @property
     def lowest(self) -> float:
-        return 0.0 if self.control == "tension" else float("-inf")
+        return float("-inf") if self.length_driven else 0.0
+
+    @property
+    def length_driven(self) -> bool:
+        return self.control == "length"
+
+    @property
+    def frictional(self) -> bool:
+        return self.friction is not None
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        options = (
+            ("length control", self.length_driven),
+            ("elastic tendons", self.stiffness is not None),
+            ("friction", self.frictional),
+        )
+        return (self.effect, *(name for name, present in options if present))
 
     def force(self, value: Scalar) -> Scalar:
         """$\\tau = -T$; a tendon driven by its length starts from none."""

@@ -32,6 +32,14 @@ class Load(Part):
     frame: eqx.AbstractVar[Frame]
     effect: eqx.AbstractClassVar[str]
 
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """What the load adds to `Scene.effects`, its kind first."""
+        return (f"follower {self.effect}" if self.frame == "body" else self.effect,)
+
+    def check(self, rod: Rod) -> None:
+        """Raises `ValueError` if the load cannot act on `rod`. A scene calls this once."""
+
     def density(self, rod: Rod, X: Scalar) -> Vector | None:
         """Wrench per length $(c, f)$ at X, six scalars; None for a load at a point."""
         return None
@@ -72,8 +80,19 @@ class Gravity(Load):
         )
         self.frame = "world"
 
+    @property
+    def effects(self) -> tuple[str, ...]:
+        return (self.effect,) if self.fluid_density is None else (self.effect, "buoyancy")
+
+    def check(self, rod: Rod) -> None:
+        if rod.material.density is None:
+            raise ValueError(
+                "Scene.loads: got a Gravity and a rod whose material has no density, need "
+                "Material(..., density=...)"
+            )
+
     def density(self, rod: Rod, X: Scalar) -> Vector:
-        assert rod.material.density is not None  # a Scene sees to it
+        assert rod.material.density is not None  # see check
         density = rod.material.density(X, rod.length)
         if self.fluid_density is not None:
             density = density - self.fluid_density

@@ -14,9 +14,9 @@ from ..numerics.component import Vector, add, dot
 from ..numerics.quadrature import make_grid, piece_edges
 from ..typing import Scalar, cast
 from ..validation import ROUNDING, concrete, instance, is_traced, numbers, precise
-from .actuator import Actuator, Tendon
+from .actuator import Actuator
 from .description import Part, describe, described_arguments, table
-from .loads import Frame, Gravity, Load
+from .loads import Frame, Load
 from .profile import Limits
 from .rod import STRAINS, Rod
 from .routing import Path, thread_tangent
@@ -86,21 +86,19 @@ class Scene(Part):
                 f"Scene.free_strains: got {free_strains!r}, need some of {', '.join(STRAINS)}"
             )
         self.free_strains = tuple(name for name in STRAINS if name in names)
-        if any(isinstance(load, Gravity) for load in self.loads) and rod.material.density is None:
-            raise ValueError(
-                "Scene.loads: got a Gravity and a rod whose material has no density, need "
-                "Material(..., density=...)"
-            )
+        for load in self.loads:
+            load.check(rod)
         self._check_numbers()
 
     def __repr__(self) -> str:
         rod = described_arguments(self.rod) if isinstance(self.rod, Part) else []
         rows = [(f"rod.{name}", text) for name, text in rod] or [("rod", describe(self.rod))]
-        rows += [
-            (f"actuators[{i}]", f"{describe(actuator)}, input in {actuator.unit}")
-            for i, actuator in enumerate(self.actuators)
-        ]
-        rows += [(f"loads[{i}]", describe(load)) for i, load in enumerate(self.loads)]
+        for name in ("actuators", "loads"):
+            parts = getattr(self, name)
+            if isinstance(parts, tuple):
+                rows += [(f"{name}[{i}]", _line(part)) for i, part in enumerate(parts)]
+            else:
+                rows.append((name, describe(parts)))
         if self.free_strains != STRAINS:
             rows.append(("free_strains", ", ".join(self.free_strains)))
         return table("Scene", rows)
@@ -109,19 +107,12 @@ class Scene(Part):
     def effects(self) -> tuple[str, ...]:
         """What the scene calls for beyond a bare rod, in words; each costs something only when it
         is named here."""
-        names = [actuator.effect for actuator in self.actuators]
-        names += [
-            f"follower {load.effect}" if load.frame == "body" else load.effect
-            for load in self.loads
-        ]
-        if any(isinstance(load, Gravity) and load.fluid_density is not None for load in self.loads):
-            names.append("buoyancy")
-        if self.breakpoints:
-            names.append("sections")
-        tendons = [actuator for actuator in self.actuators if isinstance(actuator, Tendon)]
-        names += ["length control"] * any(tendon.control == "length" for tendon in tendons)
-        names += ["elastic tendons"] * any(tendon.stiffness is not None for tendon in tendons)
-        names += ["friction"] * any(tendon.friction is not None for tendon in tendons)
+        threads = [actuator.effects for actuator in self.actuators]
+        loads = [load.effects for load in self.loads]
+        names = [effects[0] for effects in (*threads, *loads)]
+        names += [option for effects in loads for option in effects[1:]]
+        names += ["sections"] if self.breakpoints else []
+        names += [option for effects in threads for option in effects[1:]]
         if len(self.free_strains) < len(STRAINS):
             names.append("only " + ", ".join(self.free_strains))
         return tuple(dict.fromkeys(names))
@@ -134,20 +125,12 @@ class Scene(Part):
     @property
     def length_driven(self) -> tuple[int, ...]:
         """Which actuators are driven by their length."""
-        return tuple(
-            i
-            for i, a in enumerate(self.actuators)
-            if isinstance(a, Tendon) and a.control == "length"
-        )
+        return tuple(i for i, actuator in enumerate(self.actuators) if actuator.length_driven)
 
     @property
     def frictional(self) -> tuple[int, ...]:
         """Which actuators have friction."""
-        return tuple(
-            i
-            for i, a in enumerate(self.actuators)
-            if isinstance(a, Tendon) and a.friction is not None
-        )
+        return tuple(i for i, actuator in enumerate(self.actuators) if actuator.frictional)
 
     @property
     def coupled(self) -> bool:
@@ -302,6 +285,11 @@ class Scene(Part):
                     f"Scene.loads[{i}].X: got {float(point[0]):g} m, need a place on the arm of "
                     f"{length:g} m"
                 )
+
+
+def _line(part: Any) -> str:
+    text = describe(part)
+    return f"{text}, input in {part.unit}" if isinstance(part, Actuator) else text
 
 
 def _each(name: str, values: Any, kind: type, needed: str) -> tuple:
