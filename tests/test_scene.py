@@ -39,6 +39,7 @@ def test_inputs_become_thread_forces():
         ({"a": 1.0}, "inputs: got .*need finite numbers"),
     ],
 )
+@pytest.mark.usefixtures("unchecked")
 def test_bad_inputs_are_named(inputs, message):
     with pytest.raises(ValueError, match=message):
         vsr.solve(SCENE, inputs)

@@ -2,16 +2,15 @@
 positive pushes)."""
 
 from abc import abstractmethod
-from typing import Any, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from ..typing import Scalar
+from ..typing import ArrayLike, Scalar
 from ..validation import choice, concrete, instance, numbers
 from .description import Part
-from .fields import in_unit
 from .routing import Routing
 
 
@@ -80,7 +79,7 @@ class Actuator(Part):
 
 
 def _laid(
-    actuator: str, routing: Any, start: Any, end: Any
+    actuator: str, routing: Routing, start: ArrayLike | None, end: ArrayLike | None
 ) -> tuple[Routing, Scalar | None, Scalar | None]:
     needed = "a routing such as Parallel, Linear, Helix, Polynomial, Spline or Function"
     path = instance(f"{actuator}.routing", routing, Routing, needed)
@@ -101,11 +100,13 @@ class Thread(Actuator):
     fluidic chamber."""
 
     routing: Routing
-    start: Scalar | None = in_unit("m")
-    end: Scalar | None = in_unit("m")
+    start: Scalar | None = eqx.field(metadata={"unit": "m"})
+    end: Scalar | None = eqx.field(metadata={"unit": "m"})
     effect = "threads"
 
-    def __init__(self, routing: Routing, *, start: Any = None, end: Any = None):
+    def __init__(
+        self, routing: Routing, *, start: ArrayLike | None = None, end: ArrayLike | None = None
+    ):
         self.routing, self.start, self.end = _laid("Thread", routing, start, end)
 
     @property
@@ -144,10 +145,10 @@ class Tendon(Actuator):
     """
 
     routing: Routing
-    start: Scalar | None = in_unit("m")
-    end: Scalar | None = in_unit("m")
-    stiffness: Scalar | None = in_unit("N")
-    friction: Scalar | None = in_unit("-")
+    start: Scalar | None = eqx.field(metadata={"unit": "m"})
+    end: Scalar | None = eqx.field(metadata={"unit": "m"})
+    stiffness: Scalar | None = eqx.field(metadata={"unit": "N"})
+    friction: Scalar | None = eqx.field(metadata={"unit": "-"})
     control: Literal["tension", "length"] = eqx.field(static=True)
     motion: Literal["pull", "release"] = eqx.field(static=True)
     effect = "tendons"
@@ -156,11 +157,11 @@ class Tendon(Actuator):
         self,
         routing: Routing,
         *,
-        start: Any = None,
-        end: Any = None,
+        start: ArrayLike | None = None,
+        end: ArrayLike | None = None,
         control: Literal["tension", "length"] = "tension",
-        stiffness: Any = None,
-        friction: Any = None,
+        stiffness: ArrayLike | None = None,
+        friction: ArrayLike | None = None,
         motion: Literal["pull", "release"] = "pull",
     ):
         self.routing, self.start, self.end = _laid("Tendon", routing, start, end)
@@ -218,12 +219,19 @@ class Chamber(Actuator):
     """
 
     routing: Routing
-    area: Scalar = in_unit("m^2")
-    start: Scalar | None = in_unit("m")
-    end: Scalar | None = in_unit("m")
+    area: Scalar = eqx.field(metadata={"unit": "m^2"})
+    start: Scalar | None = eqx.field(metadata={"unit": "m"})
+    end: Scalar | None = eqx.field(metadata={"unit": "m"})
     effect = "chambers"
 
-    def __init__(self, routing: Routing, area: Any, *, start: Any = None, end: Any = None):
+    def __init__(
+        self,
+        routing: Routing,
+        area: ArrayLike,
+        *,
+        start: ArrayLike | None = None,
+        end: ArrayLike | None = None,
+    ):
         self.routing, self.start, self.end = _laid("Chamber", routing, start, end)
         self.area = numbers("Chamber.area", area, positive=True)
 

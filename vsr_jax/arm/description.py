@@ -33,7 +33,7 @@ class Part(eqx.Module):
 
 
 def describe(value: Any, unit: Unit = "", *, powers: bool = False) -> str:
-    """`value` in one line, its numbers in `unit`; `powers` as for `fields.in_unit`."""
+    """`value` in one line, its numbers in `unit`; `powers` as in `fields`."""
     if isinstance(value, Part):
         plain = _plain(value)
         if plain is not None:

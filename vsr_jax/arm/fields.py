@@ -1,4 +1,11 @@
-"""Units of the numbers of a scene: each field declares its own, as metadata."""
+"""What the fields of a scene's parts declare about their numbers, as metadata.
+
+`eqx.field(metadata={"unit": "m"})` is a field of numbers in metres. The keys are
+
+- `unit`: see `Unit`, or `OF_OWNER`;
+- `powers`: True if item i is the coefficient of $X^i$, in `unit` per m^i;
+- `named`: False if the number has the name of the argument that holds it, as in `Constant`.
+"""
 
 import dataclasses
 import inspect
@@ -13,17 +20,6 @@ has the unit of each item."""
 
 OF_OWNER = "of the owner"
 """Unit of the numbers of a profile: that of the field that holds the profile."""
-
-
-def in_unit(unit: Unit, *, powers: bool = False, named: bool = True) -> Any:
-    """A field of numbers in `unit`; short for `eqx.field(metadata={"unit": unit})`.
-
-    **Arguments:**
-    - `unit`: see `Unit`; or `OF_OWNER`.
-    - `powers`: item i is the coefficient of $X^i$, in `unit` per m^i.
-    - `named`: False if the number has the name of the argument that holds it (`Constant`).
-    """
-    return eqx.field(metadata={"unit": unit, "powers": powers, "named": named})
 
 
 def unit_of(field: dataclasses.Field, owner: Unit) -> Unit:
@@ -47,8 +43,8 @@ def coefficient_unit(unit: str, power: int) -> str:
 
 
 class Argument(NamedTuple):
-    """An argument of a constructor as the object stores it; `unit`, `powers` and `named` as for
-    `in_unit`."""
+    """An argument of a constructor as the object stores it; `unit`, `powers` and `named` come
+    from the metadata of its field."""
 
     name: str
     value: Any

@@ -8,19 +8,18 @@ load acts.
 """
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..numerics.component import Vector, split
-from ..typing import Scalar
+from ..numerics.component import Vector3, Wrench, split
+from ..typing import ArrayLike, Scalar, VectorLike
 from ..validation import choice, numbers
 from .description import Part
-from .fields import in_unit
-from .profile import FunctionOfX, Profile, as_profile
+from .profile import FunctionOfX, Profile, ProfilesLike, as_profile
 from .rod import Rod
 
 Frame = Literal["world", "body"]
@@ -40,11 +39,11 @@ class Load(Part):
     def check(self, rod: Rod) -> None:
         """Raises `ValueError` if the load cannot act on `rod`. A scene calls this once."""
 
-    def density(self, rod: Rod, X: Scalar) -> Vector | None:
+    def density(self, rod: Rod, X: Scalar) -> Wrench | None:
         """Wrench per length $(c, f)$ at X, six scalars; None for a load at a point."""
         return None
 
-    def point(self, rod: Rod) -> tuple[Scalar, Vector] | None:
+    def point(self, rod: Rod) -> tuple[Scalar, Wrench] | None:
         """Where a load at a point acts [m] and its wrench $(M, F)$; None for a load along the
         arm."""
         return None
@@ -66,12 +65,14 @@ class Gravity(Load):
     The rod's material needs a `density`.
     """
 
-    acceleration: Float[Array, "3"] = in_unit("m/s^2")
-    fluid_density: Scalar | None = in_unit("kg/m^3")
+    acceleration: Float[Array, "3"] = eqx.field(metadata={"unit": "m/s^2"})
+    fluid_density: Scalar | None = eqx.field(metadata={"unit": "kg/m^3"})
     frame: Frame = eqx.field(static=True, default="world", init=False)
     effect = "gravity"
 
-    def __init__(self, acceleration: Any = (0.0, 0.0, -9.81), fluid_density: Any = None):
+    def __init__(
+        self, acceleration: VectorLike = (0.0, 0.0, -9.81), fluid_density: ArrayLike | None = None
+    ):
         self.acceleration = numbers("Gravity.acceleration", acceleration, (3,))
         self.fluid_density = (
             None
@@ -91,14 +92,15 @@ class Gravity(Load):
                 "Material(..., density=...)"
             )
 
-    def density(self, rod: Rod, X: Scalar) -> Vector:
+    def density(self, rod: Rod, X: Scalar) -> Wrench:
         assert rod.material.density is not None  # see check
         density = rod.material.density(X, rod.length)
         if self.fluid_density is not None:
             density = density - self.fluid_density
         weight = density * rod.section.geometry(X, rod.length).area
         zero = jnp.zeros_like(weight)
-        return (zero, zero, zero, *(weight * g for g in self.acceleration))
+        x, y, z = (weight * g for g in self.acceleration)
+        return zero, zero, zero, x, y, z
 
 
 class PointWrench(Load):
@@ -110,17 +112,17 @@ class PointWrench(Load):
     - `frame`: `"world"` for a dead wrench, `"body"` for one that follows the section.
     """
 
-    X: Scalar = in_unit("m")
-    force: Float[Array, "3"] = in_unit("N")
-    moment: Float[Array, "3"] = in_unit("N m")
+    X: Scalar = eqx.field(metadata={"unit": "m"})
+    force: Float[Array, "3"] = eqx.field(metadata={"unit": "N"})
+    moment: Float[Array, "3"] = eqx.field(metadata={"unit": "N m"})
     frame: Frame = eqx.field(static=True)
     effect = "point wrench"
 
     def __init__(
         self,
-        X: Any,
-        force: Any = (0.0, 0.0, 0.0),
-        moment: Any = (0.0, 0.0, 0.0),
+        X: ArrayLike,
+        force: VectorLike = (0.0, 0.0, 0.0),
+        moment: VectorLike = (0.0, 0.0, 0.0),
         frame: Frame = "world",
     ):
         self.X = numbers("PointWrench.X", X, least=0.0)
@@ -128,8 +130,8 @@ class PointWrench(Load):
         self.moment = numbers("PointWrench.moment", moment, (3,))
         self.frame = choice("PointWrench.frame", frame, ("world", "body"))
 
-    def point(self, rod: Rod) -> tuple[Scalar, Vector]:
-        return self.X, (*split(self.moment), *split(self.force))
+    def point(self, rod: Rod) -> tuple[Scalar, Wrench]:
+        return self.X, (*_three(self.moment), *_three(self.force))
 
     def breakpoints(self, rod: Rod) -> tuple[Scalar, ...]:
         return (self.X,)
@@ -138,20 +140,23 @@ class PointWrench(Load):
 class TipWrench(Load):
     """A force and a moment on the arm's end; arguments as for `PointWrench`."""
 
-    force: Float[Array, "3"] = in_unit("N")
-    moment: Float[Array, "3"] = in_unit("N m")
+    force: Float[Array, "3"] = eqx.field(metadata={"unit": "N"})
+    moment: Float[Array, "3"] = eqx.field(metadata={"unit": "N m"})
     frame: Frame = eqx.field(static=True)
     effect = "tip wrench"
 
     def __init__(
-        self, force: Any = (0.0, 0.0, 0.0), moment: Any = (0.0, 0.0, 0.0), frame: Frame = "world"
+        self,
+        force: VectorLike = (0.0, 0.0, 0.0),
+        moment: VectorLike = (0.0, 0.0, 0.0),
+        frame: Frame = "world",
     ):
         self.force = numbers("TipWrench.force", force, (3,))
         self.moment = numbers("TipWrench.moment", moment, (3,))
         self.frame = choice("TipWrench.frame", frame, ("world", "body"))
 
-    def point(self, rod: Rod) -> tuple[Scalar, Vector]:
-        return rod.length, (*split(self.moment), *split(self.force))
+    def point(self, rod: Rod) -> tuple[Scalar, Wrench]:
+        return rod.length, (*_three(self.moment), *_three(self.force))
 
 
 class DistributedWrench(Load):
@@ -163,19 +168,22 @@ class DistributedWrench(Load):
     - `frame`: `"world"` for a dead load, `"body"` for one that follows the sections.
     """
 
-    force: tuple[Profile, ...] | FunctionOfX = in_unit("N/m")
-    moment: tuple[Profile, ...] | FunctionOfX = in_unit("N")
+    force: tuple[Profile, ...] | FunctionOfX = eqx.field(metadata={"unit": "N/m"})
+    moment: tuple[Profile, ...] | FunctionOfX = eqx.field(metadata={"unit": "N"})
     frame: Frame = eqx.field(static=True)
     effect = "distributed wrench"
 
     def __init__(
-        self, force: Any = (0.0, 0.0, 0.0), moment: Any = (0.0, 0.0, 0.0), frame: Frame = "world"
+        self,
+        force: ProfilesLike = (0.0, 0.0, 0.0),
+        moment: ProfilesLike = (0.0, 0.0, 0.0),
+        frame: Frame = "world",
     ):
         self.force = _three_profiles("DistributedWrench.force", force)
         self.moment = _three_profiles("DistributedWrench.moment", moment)
         self.frame = choice("DistributedWrench.frame", frame, ("world", "body"))
 
-    def density(self, rod: Rod, X: Scalar) -> Vector:
+    def density(self, rod: Rod, X: Scalar) -> Wrench:
         return (*_at(self.moment, rod, X), *_at(self.force, rod, X))
 
     def breakpoints(self, rod: Rod) -> tuple[Scalar, ...]:
@@ -188,7 +196,7 @@ class DistributedWrench(Load):
         return tuple(x for profile in profiles for x in profile.breakpoints)
 
 
-def _three_profiles(name: str, value: Any) -> tuple[Profile, ...] | FunctionOfX:
+def _three_profiles(name: str, value: ProfilesLike) -> tuple[Profile, ...] | FunctionOfX:
     if isinstance(value, FunctionOfX):
         return value
     if callable(value):
@@ -205,7 +213,14 @@ def _three_profiles(name: str, value: Any) -> tuple[Profile, ...] | FunctionOfX:
     return tuple(as_profile(f"{name}[{i}]", x) for i, x in enumerate(value))
 
 
-def _at(vector: tuple[Profile, ...] | FunctionOfX, rod: Rod, X: Scalar) -> Vector:
+def _at(vector: tuple[Profile, ...] | FunctionOfX, rod: Rod, X: Scalar) -> Vector3:
     if isinstance(vector, FunctionOfX):
-        return tuple(jnp.asarray(x, X.dtype) for x in vector(X))
-    return tuple(profile(X, rod.length) for profile in vector)
+        x, y, z = (jnp.asarray(value, X.dtype) for value in vector(X))
+    else:
+        x, y, z = (profile(X, rod.length) for profile in vector)
+    return x, y, z
+
+
+def _three(array: Float[Array, "3"]) -> Vector3:
+    x, y, z = split(array)
+    return x, y, z

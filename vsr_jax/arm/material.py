@@ -1,15 +1,13 @@
 r"""Materials: with a section they make the stiffness $\Sigma = \mathrm{diag}(G J_x, E J_y, E J_z, E
 A, \kappa_y G A, \kappa_z G A)$."""
 
-from typing import Any
-
+import equinox as eqx
 import jax.numpy as jnp
 
 from ..numerics.component import Vector
 from ..typing import Scalar
 from .description import Part
-from .fields import in_unit
-from .profile import Limits, Profile, as_profile
+from .profile import Limits, Profile, ProfileLike, as_profile
 from .section import Section
 
 LEAST_POISSON, MOST_POISSON = -1.0, 0.5
@@ -27,12 +25,18 @@ class Material(Part):
     - `density`: $\\rho$ [kg/m^3], needed by `Gravity` only.
     """
 
-    young: Profile = in_unit("Pa")
-    shear: Profile | None = in_unit("Pa")
-    poisson: Profile | None = in_unit("-")
-    density: Profile | None = in_unit("kg/m^3")
+    young: Profile = eqx.field(metadata={"unit": "Pa"})
+    shear: Profile | None = eqx.field(metadata={"unit": "Pa"})
+    poisson: Profile | None = eqx.field(metadata={"unit": "-"})
+    density: Profile | None = eqx.field(metadata={"unit": "kg/m^3"})
 
-    def __init__(self, young: Any, shear: Any = None, poisson: Any = None, density: Any = None):
+    def __init__(
+        self,
+        young: ProfileLike,
+        shear: ProfileLike | None = None,
+        poisson: ProfileLike | None = None,
+        density: ProfileLike | None = None,
+    ):
         if (shear is None) == (poisson is None):
             raise ValueError(
                 f"Material: got shear={shear!r} and poisson={poisson!r}, need one of the two"

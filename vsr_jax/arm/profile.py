@@ -5,21 +5,22 @@ of its numbers. Wherever a profile is expected a plain number means `Constant` a
 of X means `FunctionProfile`.
 """
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
+from functools import partial
 from operator import attrgetter
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
-from ..typing import Scalar
+from ..typing import ArrayLike, Scalar, Tree, VectorLike
 from ..validation import concrete, numbers
 from .description import Part, describe
-from .fields import OF_OWNER, in_unit
+from .fields import OF_OWNER
 from .spline import spline_breakpoints, spline_points, spline_value
 
 Limits = dict[tuple[str, str], tuple[Array, Array]]
@@ -40,7 +41,7 @@ class FunctionOfX(eqx.Module):
     function: Callable = eqx.field(static=True)
     parameters: tuple
 
-    def __init__(self, owner: str, function: Callable, *parameters: Any):
+    def __init__(self, owner: str, function: Callable, *parameters: PyTree):
         if not callable(function):
             raise ValueError(f"{owner}.function: got {function!r}, need a function of X")
         self.function = function
@@ -48,7 +49,7 @@ class FunctionOfX(eqx.Module):
             lambda leaf: jnp.asarray(leaf) if eqx.is_array_like(leaf) else leaf, parameters
         )
 
-    def __call__(self, X: Scalar) -> Any:
+    def __call__(self, X: Scalar) -> PyTree:
         """Whatever the function returns at X [m]."""
         return self.function(X, *self.parameters)
 
@@ -70,12 +71,20 @@ class Profile(Part):
         return ()
 
 
+ProfileLike = Profile | ArrayLike | Callable[..., ArrayLike]
+"""What is converted to a profile: a number, or a function of X."""
+
+ProfilesLike = ArrayLike | Sequence[ProfileLike] | Callable[..., Sequence[ArrayLike] | Array]
+"""What is converted to several profiles: one for each, or one function of X that returns a number
+for each."""
+
+
 class Constant(Profile):
     """$f(X) = c$."""
 
-    value: Scalar = in_unit(OF_OWNER, named=False)
+    value: Scalar = eqx.field(metadata={"unit": OF_OWNER, "named": False})
 
-    def __init__(self, value: Any):
+    def __init__(self, value: ArrayLike):
         self.value = numbers("Constant.value", value)
 
     def __call__(self, X: Scalar, length: Scalar) -> Scalar:
@@ -85,10 +94,10 @@ class Constant(Profile):
 class Taper(Profile):
     """$f(X) = f_b + (f_t - f_b) X / L$: from `base` at X = 0 to `tip` at X = L."""
 
-    base: Scalar = in_unit(OF_OWNER)
-    tip: Scalar = in_unit(OF_OWNER)
+    base: Scalar = eqx.field(metadata={"unit": OF_OWNER})
+    tip: Scalar = eqx.field(metadata={"unit": OF_OWNER})
 
-    def __init__(self, base: Any, tip: Any):
+    def __init__(self, base: ArrayLike, tip: ArrayLike):
         self.base = numbers("Taper.base", base)
         self.tip = numbers("Taper.tip", tip)
 
@@ -99,9 +108,9 @@ class Taper(Profile):
 class PolynomialProfile(Profile):
     """$f(X) = \\sum_i c_i X^i$, `coefficients` in rising order, units of $f$ per m^i."""
 
-    coefficients: Float[Array, " terms"] = in_unit(OF_OWNER, powers=True)
+    coefficients: Float[Array, " terms"] = eqx.field(metadata={"unit": OF_OWNER, "powers": True})
 
-    def __init__(self, coefficients: Any):
+    def __init__(self, coefficients: VectorLike):
         self.coefficients = rising_coefficients("PolynomialProfile.coefficients", coefficients)
 
     def __call__(self, X: Scalar, length: Scalar) -> Scalar:
@@ -112,10 +121,10 @@ class SplineProfile(Profile):
     """Cubic not-a-knot spline through `values` at the abscissas `X` [m], see
     `spline_value`."""
 
-    X: Float[Array, " points"] = in_unit("m")
-    values: Float[Array, " points"] = in_unit(OF_OWNER)
+    X: Float[Array, " points"] = eqx.field(metadata={"unit": "m"})
+    values: Float[Array, " points"] = eqx.field(metadata={"unit": OF_OWNER})
 
-    def __init__(self, X: Any, values: Any):
+    def __init__(self, X: VectorLike, values: VectorLike):
         self.X = spline_points("SplineProfile.X", X)
         self.values = numbers("SplineProfile.values", values, self.X.shape)
 
@@ -136,10 +145,10 @@ class Piecewise(Profile):
       of X on the whole arm.
     """
 
-    ends: Float[Array, " inner"] = in_unit("m")
-    values: tuple[Profile, ...] = in_unit(OF_OWNER)
+    ends: Float[Array, " inner"] = eqx.field(metadata={"unit": "m"})
+    values: tuple[Profile, ...] = eqx.field(metadata={"unit": OF_OWNER})
 
-    def __init__(self, ends: Any, values: Sequence[Any]):
+    def __init__(self, ends: VectorLike, values: Sequence[ProfileLike]):
         self.ends = rising_ends("Piecewise", ends, values)
         self.values = tuple(
             as_profile(f"Piecewise.values[{i}]", value) for i, value in enumerate(values)
@@ -156,7 +165,7 @@ class Piecewise(Profile):
         )
 
 
-def rising_coefficients(name: str, value: Any) -> Float[Array, " terms"]:
+def rising_coefficients(name: str, value: VectorLike) -> Float[Array, " terms"]:
     """`value` as the coefficients of a polynomial, at least one."""
     array = numbers(name, value, None)
     if array.ndim != 1 or array.size == 0:
@@ -164,7 +173,7 @@ def rising_coefficients(name: str, value: Any) -> Float[Array, " terms"]:
     return array
 
 
-def rising_ends(owner: str, ends: Any, parts: Sequence[Any]) -> Float[Array, " inner"]:
+def rising_ends(owner: str, ends: VectorLike, parts: Sequence[object]) -> Float[Array, " inner"]:
     """Inner ends of `parts` laid one after another, checked."""
     array = numbers(f"{owner}.ends", ends, None)
     known = concrete(array)
@@ -177,7 +186,7 @@ def rising_ends(owner: str, ends: Any, parts: Sequence[Any]) -> Float[Array, " i
     return array
 
 
-def pick(X: Scalar, ends: Float[Array, " inner"], values: Sequence[Any]) -> Any:
+def pick(X: Scalar, ends: Float[Array, " inner"], values: Sequence[Tree]) -> Tree:
     """The one of `values`, numbers or pytrees of them, in whose part X lies."""
     result = values[-1]
     for i in reversed(range(ends.size)):
@@ -193,7 +202,7 @@ class FunctionProfile(Profile):
 
     function: FunctionOfX
 
-    def __init__(self, function: Callable, *parameters: Any):
+    def __init__(self, function: Callable[..., ArrayLike], *parameters: PyTree):
         self.function = FunctionOfX("FunctionProfile", function, *parameters)
 
     def __call__(self, X: Scalar, length: Scalar) -> Scalar:
@@ -204,7 +213,7 @@ class _Scaled(Profile):
     """A factor times a profile."""
 
     factor: float = eqx.field(static=True)
-    profile: Profile = in_unit(OF_OWNER)
+    profile: Profile = eqx.field(metadata={"unit": OF_OWNER})
 
     def __call__(self, X: Scalar, length: Scalar) -> Scalar:
         return self.factor * self.profile(X, length)
@@ -214,22 +223,31 @@ class _Scaled(Profile):
         return self.profile.breakpoints
 
 
-def as_profile(name: str, value: Any, **limits: Any) -> Profile:
+def as_profile(
+    name: str,
+    value: ProfileLike,
+    *,
+    positive: bool = False,
+    above: float = -math.inf,
+    most: float = math.inf,
+) -> Profile:
     """`value` as a profile: a `Profile` itself, a function of X, or a number; its numbers within
-    `limits`, as for `numbers`."""
+    limits, as for `numbers`."""
+    check = partial(numbers, positive=positive, above=above, most=most)
     if isinstance(value, Taper):
-        numbers(f"{name} (Taper.base)", value.base, **limits)
-        numbers(f"{name} (Taper.tip)", value.tip, **limits)
+        check(f"{name} (Taper.base)", value.base)
+        check(f"{name} (Taper.tip)", value.tip)
     if isinstance(value, Constant):
-        numbers(name, value.value, **limits)
-    if isinstance(value, Piecewise) and limits:
+        check(name, value.value)
+    if isinstance(value, Piecewise):
         for i, part in enumerate(value.values):
-            as_profile(f"{name} (Piecewise.values[{i}])", part, **limits)
+            label = f"{name} (Piecewise.values[{i}])"
+            as_profile(label, part, positive=positive, above=above, most=most)
     if isinstance(value, Profile):
         return value
     if callable(value):
         return FunctionProfile(value)
-    return Constant(numbers(name, value, **limits))
+    return Constant(check(name, value))
 
 
 _LINEAR_IN = {

@@ -1,19 +1,18 @@
 """The rod: a slender arm with its section, material, rest strain and base."""
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from ..numerics.component import Vector, norm
-from ..typing import Pose, Scalar
+from ..typing import ArrayLike, MatrixLike, Pose, Scalar
 from ..validation import instance, numbers, rigid
 from .description import Part
-from .fields import in_unit
 from .material import Material
-from .profile import FunctionOfX, Limits, Profile, as_profile
+from .profile import FunctionOfX, Limits, Profile, ProfilesLike, as_profile
 from .section import Section
 
 STRAINS = ("torsion", "bending_y", "bending_z", "elongation", "shear_y", "shear_z")
@@ -21,6 +20,9 @@ STRAINS = ("torsion", "bending_y", "bending_z", "elongation", "shear_y", "shear_
 
 STRAIGHT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
 """Strains of a straight rod without shear, stretch and twist."""
+
+
+_STRAIN_UNITS = ("1/m", "1/m", "1/m", "-", "-", "-")
 
 
 class Rod(Part):
@@ -38,22 +40,22 @@ class Rod(Part):
       default they run inside the section.
     """
 
-    length: Scalar = in_unit("m")
+    length: Scalar = eqx.field(metadata={"unit": "m"})
     section: Section
     material: Material
-    rest_strain: tuple[Profile, ...] | FunctionOfX = in_unit(("1/m",) * 3 + ("-",) * 3)
-    base: Pose | None = in_unit("-")
-    guide_radius: Scalar | None = in_unit("m")
+    rest_strain: tuple[Profile, ...] | FunctionOfX = eqx.field(metadata={"unit": _STRAIN_UNITS})
+    base: Pose | None = eqx.field(metadata={"unit": "-"})
+    guide_radius: Scalar | None = eqx.field(metadata={"unit": "m"})
 
     def __init__(
         self,
-        length: Any,
+        length: ArrayLike,
         section: Section,
         material: Material,
         *,
-        rest_strain: Sequence[Any] | Callable | None = STRAIGHT,
-        base: Any = None,
-        guide_radius: Any = None,
+        rest_strain: ProfilesLike | None = STRAIGHT,
+        base: MatrixLike | None = None,
+        guide_radius: ArrayLike | None = None,
     ):
         self.length = numbers("Rod.length", length, positive=True)
         self.section = instance(
@@ -122,7 +124,7 @@ class Rod(Part):
         )
 
 
-def _rest_strain(value: Any) -> tuple[Profile, ...] | FunctionOfX:
+def _rest_strain(value: ProfilesLike | None) -> tuple[Profile, ...] | FunctionOfX:
     if value is None:
         value = STRAIGHT
     if isinstance(value, FunctionOfX):

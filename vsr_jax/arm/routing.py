@@ -8,18 +8,17 @@ are taken by forward differentiation, so a path is written down once.
 import math
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
-from ..numerics.component import Vector
-from ..typing import Scalar
+from ..numerics.component import Vector, Vector3
+from ..typing import ArrayLike, Scalar, VectorLike
 from ..validation import choice, numbers
 from .description import Part
-from .fields import in_unit
 from .profile import FunctionOfX, rising_coefficients
 from .spline import spline_breakpoints, spline_points, spline_value
 
@@ -34,7 +33,7 @@ class Path(NamedTuple):
     slope_z: Array
 
 
-def thread_tangent(xi: Vector, path: Path) -> Vector:
+def thread_tangent(xi: Vector, path: Path) -> Vector3:
     """Tangent of a thread's path in the section's frame (eq. 11): $t_c = k \\times d + u + d'$."""
     kx, ky, kz, ux, uy, uz = xi
     return (
@@ -65,10 +64,10 @@ class Routing(Part):
 class Parallel(Routing):
     """Parallel to the axis: $d = (0, y, z)$, in metres."""
 
-    y: Scalar = in_unit("m")
-    z: Scalar = in_unit("m")
+    y: Scalar = eqx.field(metadata={"unit": "m"})
+    z: Scalar = eqx.field(metadata={"unit": "m"})
 
-    def __init__(self, y: Any, z: Any):
+    def __init__(self, y: ArrayLike, z: ArrayLike):
         self.y = numbers("Parallel.y", y)
         self.z = numbers("Parallel.z", z)
 
@@ -80,12 +79,14 @@ class Linear(Routing):
     """Straight and oblique (eq. 22): $d = (0, y + \\bar y X, z + \\bar z X)$, slopes $\\bar y,
     \\bar z$ without unit."""
 
-    y: Scalar = in_unit("m")
-    z: Scalar = in_unit("m")
-    slope_y: Scalar = in_unit("-")
-    slope_z: Scalar = in_unit("-")
+    y: Scalar = eqx.field(metadata={"unit": "m"})
+    z: Scalar = eqx.field(metadata={"unit": "m"})
+    slope_y: Scalar = eqx.field(metadata={"unit": "-"})
+    slope_z: Scalar = eqx.field(metadata={"unit": "-"})
 
-    def __init__(self, y: Any, z: Any, slope_y: Any = 0.0, slope_z: Any = 0.0):
+    def __init__(
+        self, y: ArrayLike, z: ArrayLike, slope_y: ArrayLike = 0.0, slope_z: ArrayLike = 0.0
+    ):
         self.y = numbers("Linear.y", y)
         self.z = numbers("Linear.z", z)
         self.slope_y = numbers("Linear.slope_y", slope_y)
@@ -107,19 +108,19 @@ class Helix(Routing):
     - `hand`: `"right"` winds from y towards z along the arm, `"left"` the other way.
     """
 
-    radius: Scalar = in_unit("m")
-    angle: Scalar | None = in_unit("rad")
-    pitch: Scalar | None = in_unit("m")
-    phase: Scalar = in_unit("rad")
+    radius: Scalar = eqx.field(metadata={"unit": "m"})
+    angle: Scalar | None = eqx.field(metadata={"unit": "rad"})
+    pitch: Scalar | None = eqx.field(metadata={"unit": "m"})
+    phase: Scalar = eqx.field(metadata={"unit": "rad"})
     hand: Literal["right", "left"] = eqx.field(static=True)
 
     def __init__(
         self,
-        radius: Any,
-        angle: Any = None,
+        radius: ArrayLike,
+        angle: ArrayLike | None = None,
         *,
-        pitch: Any = None,
-        phase: Any = 0.0,
+        pitch: ArrayLike | None = None,
+        phase: ArrayLike = 0.0,
         hand: Literal["right", "left"] = "right",
     ):
         if (angle is None) == (pitch is None):
@@ -149,10 +150,10 @@ class Polynomial(Routing):
     """Polynomial path: $d_y = \\sum_i y_i X^i$, $d_z = \\sum_i z_i X^i$, coefficients in rising
     order [m^(1-i)]."""
 
-    y: Float[Array, " terms_y"] = in_unit("m", powers=True)
-    z: Float[Array, " terms_z"] = in_unit("m", powers=True)
+    y: Float[Array, " terms_y"] = eqx.field(metadata={"unit": "m", "powers": True})
+    z: Float[Array, " terms_z"] = eqx.field(metadata={"unit": "m", "powers": True})
 
-    def __init__(self, y: Any, z: Any):
+    def __init__(self, y: VectorLike, z: VectorLike):
         self.y = rising_coefficients("Polynomial.y", y)
         self.z = rising_coefficients("Polynomial.z", z)
 
@@ -163,11 +164,11 @@ class Polynomial(Routing):
 class Spline(Routing):
     """Cubic not-a-knot spline through the points (X, y, z), in metres, at least two."""
 
-    X: Float[Array, " points"] = in_unit("m")
-    y: Float[Array, " points"] = in_unit("m")
-    z: Float[Array, " points"] = in_unit("m")
+    X: Float[Array, " points"] = eqx.field(metadata={"unit": "m"})
+    y: Float[Array, " points"] = eqx.field(metadata={"unit": "m"})
+    z: Float[Array, " points"] = eqx.field(metadata={"unit": "m"})
 
-    def __init__(self, X: Any, y: Any, z: Any):
+    def __init__(self, X: VectorLike, y: VectorLike, z: VectorLike):
         self.X = spline_points("Spline.X", X)
         self.y = numbers("Spline.y", y, self.X.shape)
         self.z = numbers("Spline.z", z, self.X.shape)
@@ -190,7 +191,7 @@ class Function(Routing):
 
     function: FunctionOfX
 
-    def __init__(self, function: Callable, *parameters: Any):
+    def __init__(self, function: Callable[..., tuple[ArrayLike, ArrayLike]], *parameters: PyTree):
         self.function = FunctionOfX("Function", function, *parameters)
 
     def __call__(self, X: Scalar) -> tuple[Scalar, Scalar]:

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..numerics.component import Vector, add, dot
+from ..numerics.component import Forces, Vector, Wrench, add, dot
 from ..numerics.quadrature import make_grid, piece_edges
-from ..typing import Scalar, cast
+from ..typing import DTypeLike, Scalar, VectorLike, cast
 from ..validation import ROUNDING, concrete, instance, is_traced, numbers, precise
 from .actuator import Actuator
 from .description import Part, describe, described_arguments, table
@@ -32,12 +32,12 @@ class CrossSections(NamedTuple):
     paths: tuple[Path, ...]
     reach: tuple[Array | None, ...]
 
-    def carry(self, forces: Vector) -> Vector:
+    def carry(self, forces: Forces) -> Forces:
         """Force of each thread here: that of its start where it reaches, none elsewhere."""
         return shared(forces, self.reach)
 
 
-def shared(forces: Vector, shares: tuple[Array | None, ...]) -> Vector:
+def shared(forces: Forces, shares: tuple[Array | None, ...]) -> Forces:
     """Forces of threads, each times its share; None stands for all of it."""
     return tuple(f if share is None else f * share for f, share in zip(forces, shares, strict=True))
 
@@ -68,8 +68,8 @@ class Scene(Part):
     def __init__(
         self,
         rod: Rod,
-        actuators: Sequence[Actuator] = (),
-        loads: Sequence[Load] = (),
+        actuators: Sequence[Actuator] | Actuator = (),
+        loads: Sequence[Load] | Load = (),
         *,
         free_strains: Sequence[str] = STRAINS,
     ):
@@ -166,13 +166,13 @@ class Scene(Part):
         nodes = jax.vmap(at)(X.reshape(-1))
         return jax.tree.map(lambda leaf: leaf.reshape(X.shape), nodes)
 
-    def forces(self, inputs: Float[Array, " inputs"]) -> Vector:
+    def forces(self, inputs: Float[Array, " inputs"]) -> Forces:
         r"""Signed thread forces $\tau$ [N] for the inputs, one scalar a thread."""
         return tuple(
             actuator.force(value) for actuator, value in zip(self.actuators, inputs, strict=True)
         )
 
-    def density(self, X: Array, frame: Frame) -> Vector | None:
+    def density(self, X: Array, frame: Frame) -> Wrench | None:
         """Load per length $(c, f)$ of all loads of a frame at abscissas X of any shape; None if the
         scene has none."""
         total = None
@@ -180,11 +180,11 @@ class Scene(Part):
             if load.frame != frame or load.point(self.rod) is not None:
                 continue
             here = jax.vmap(lambda x, load=load: load.density(self.rod, x) or ())(X.reshape(-1))
-            here = tuple(jnp.broadcast_to(x, X.size).reshape(X.shape) for x in here)
+            here = jax.tree.map(lambda x: jnp.broadcast_to(x, X.size).reshape(X.shape), here)
             total = here if total is None else add(total, here)
         return total
 
-    def point_wrenches(self, frame: Frame) -> tuple[tuple[Scalar, Vector], ...]:
+    def point_wrenches(self, frame: Frame) -> tuple[tuple[Scalar, Wrench], ...]:
         """Abscissa and wrench $(M, F)$ of each load of a frame that acts at a point."""
         points = [load.point(self.rod) for load in self.loads if load.frame == frame]
         return tuple(point for point in points if point is not None)
@@ -196,7 +196,7 @@ class Scene(Part):
         ]
         return jnp.all(jnp.stack(checks)) if checks else jnp.array(True)
 
-    def check_inputs(self, inputs: Any) -> Float[Array, " inputs"]:
+    def check_inputs(self, inputs: VectorLike) -> Float[Array, " inputs"]:
         """`inputs` as an array, one number an actuator.
 
         **Raises:** `ValueError` for a wrong number of inputs and, while their values are known, for
@@ -236,7 +236,7 @@ class Scene(Part):
         """Length of a thread's path in the arm at rest [m]."""
         return _rest_length(self, place)
 
-    def astype(self, dtype: Any) -> "Scene":
+    def astype(self, dtype: DTypeLike) -> "Scene":
         """The same scene with its floating-point numbers in `dtype`, float32 or float64."""
         precise("dtype", jnp.zeros((), dtype))
         return cast(self, dtype)

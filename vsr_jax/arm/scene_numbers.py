@@ -52,7 +52,7 @@ def parameters(scene: Scene) -> dict[str, Parameter]:
     return dict(_walk(scene, "", "", False, ()))
 
 
-def matching(pattern: str, known: Mapping[str, Any]) -> list[str]:
+def matching(pattern: str, known: Mapping[str, object]) -> list[str]:
     """Names that a pattern stands for: `actuators[*].routing.radius` is the radius of each.
 
     **Raises:** `ValueError` for a name that nothing has.

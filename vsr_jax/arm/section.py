@@ -7,18 +7,17 @@ function of X.
 import math
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..numerics.component import norm
-from ..typing import Scalar
+from ..typing import Scalar, VectorLike
 from ..validation import choice, concrete, instance, numbers
 from .description import Part
-from .fields import in_unit
-from .profile import Constant, Limits, Profile, as_profile, pick, rising_ends, scaled
+from .profile import Constant, Limits, Profile, ProfileLike, as_profile, pick, rising_ends, scaled
 
 Torsion = Literal["saint_venant", "polar"]
 
@@ -27,11 +26,11 @@ class Geometry(eqx.Module):
     """Area [m^2], second moments about y and z and torsion constant [m^4], and shear factors [-] of
     one cross-section."""
 
-    area: Scalar = in_unit("m^2")
-    moment_y: Scalar = in_unit("m^4")
-    moment_z: Scalar = in_unit("m^4")
-    torsion: Scalar = in_unit("m^4")
-    shear_factors: Float[Array, "2"] = in_unit("-")
+    area: Scalar = eqx.field(metadata={"unit": "m^2"})
+    moment_y: Scalar = eqx.field(metadata={"unit": "m^4"})
+    moment_z: Scalar = eqx.field(metadata={"unit": "m^4"})
+    torsion: Scalar = eqx.field(metadata={"unit": "m^4"})
+    shear_factors: Float[Array, "2"] = eqx.field(metadata={"unit": "-"})
 
 
 class Section(Part):
@@ -73,11 +72,11 @@ class Section(Part):
         return tuple(x for size in self.sizes.values() for x in size.breakpoints)
 
 
-def _size(section: str, name: str, value: Any) -> Profile:
+def _size(section: str, name: str, value: ProfileLike) -> Profile:
     return as_profile(f"{section}.{name}", value, positive=True)
 
 
-def _options(torsion: Torsion, shear_correction: Any) -> tuple[Torsion, Float[Array, "2"]]:
+def _options(torsion: Torsion, shear_correction: VectorLike) -> tuple[Torsion, Float[Array, "2"]]:
     factor = numbers("shear_correction", shear_correction, None, positive=True)
     if factor.shape not in ((), (2,)):
         raise ValueError(f"shear_correction: got shape {factor.shape}, need one number or two")
@@ -90,20 +89,25 @@ class Circular(Section):
     **Arguments:** `radius` or `diameter` [m], one of the two; the radius is what is kept.
     """
 
-    radius: Profile = in_unit("m")
+    radius: Profile = eqx.field(metadata={"unit": "m"})
     torsion: Torsion = eqx.field(static=True)
-    shear_correction: Float[Array, "2"] = in_unit("-")
+    shear_correction: Float[Array, "2"] = eqx.field(metadata={"unit": "-"})
 
-    def __init__(self, radius: Any = None, *, diameter: Any = None, shear_correction: Any = 1.0):
+    def __init__(
+        self,
+        radius: ProfileLike | None = None,
+        *,
+        diameter: ProfileLike | None = None,
+        shear_correction: VectorLike = 1.0,
+    ):
         if (radius is None) == (diameter is None):
             raise ValueError(
                 f"Circular: got radius={radius!r} and diameter={diameter!r}, need one of the two"
             )
-        self.radius = (
-            scaled(0.5, _size("Circular", "diameter", diameter))
-            if radius is None
-            else _size("Circular", "radius", radius)
-        )
+        if radius is not None:
+            self.radius = _size("Circular", "radius", radius)
+        elif diameter is not None:
+            self.radius = scaled(0.5, _size("Circular", "diameter", diameter))
         self.torsion, self.shear_correction = _options("saint_venant", shear_correction)
 
     def geometry(self, X: Scalar, length: Scalar) -> Geometry:
@@ -127,12 +131,14 @@ class Annular(Section):
     """Tube of radii $r < R$: $A = \\pi (R^2 - r^2)$, $J_y = J_z = \\pi (R^4 - r^4) / 4$, $J_x = 2
     J_y$."""
 
-    outer: Profile = in_unit("m")
-    inner: Profile = in_unit("m")
+    outer: Profile = eqx.field(metadata={"unit": "m"})
+    inner: Profile = eqx.field(metadata={"unit": "m"})
     torsion: Torsion = eqx.field(static=True)
-    shear_correction: Float[Array, "2"] = in_unit("-")
+    shear_correction: Float[Array, "2"] = eqx.field(metadata={"unit": "-"})
 
-    def __init__(self, outer: Any, inner: Any, *, shear_correction: Any = 1.0):
+    def __init__(
+        self, outer: ProfileLike, inner: ProfileLike, *, shear_correction: VectorLike = 1.0
+    ):
         self.outer = _size("Annular", "outer", outer)
         self.inner = _size("Annular", "inner", inner)
         if isinstance(self.outer, Constant) and isinstance(self.inner, Constant):
@@ -180,18 +186,18 @@ class Rectangular(Section):
     Goodier, Theory of Elasticity, art. 109.
     """
 
-    width: Profile = in_unit("m")
-    height: Profile = in_unit("m")
+    width: Profile = eqx.field(metadata={"unit": "m"})
+    height: Profile = eqx.field(metadata={"unit": "m"})
     torsion: Torsion = eqx.field(static=True)
-    shear_correction: Float[Array, "2"] = in_unit("-")
+    shear_correction: Float[Array, "2"] = eqx.field(metadata={"unit": "-"})
 
     def __init__(
         self,
-        width: Any,
-        height: Any,
+        width: ProfileLike,
+        height: ProfileLike,
         *,
         torsion: Torsion = "saint_venant",
-        shear_correction: Any = 1.0,
+        shear_correction: VectorLike = 1.0,
     ):
         self.width = _size("Rectangular", "width", width)
         self.height = _size("Rectangular", "height", height)
@@ -238,18 +244,18 @@ class Elliptic(Section):
     a^3 b^3}{a^2 + b^2}$.
     """
 
-    semi_axis_y: Profile = in_unit("m")
-    semi_axis_z: Profile = in_unit("m")
+    semi_axis_y: Profile = eqx.field(metadata={"unit": "m"})
+    semi_axis_z: Profile = eqx.field(metadata={"unit": "m"})
     torsion: Torsion = eqx.field(static=True)
-    shear_correction: Float[Array, "2"] = in_unit("-")
+    shear_correction: Float[Array, "2"] = eqx.field(metadata={"unit": "-"})
 
     def __init__(
         self,
-        semi_axis_y: Any,
-        semi_axis_z: Any,
+        semi_axis_y: ProfileLike,
+        semi_axis_z: ProfileLike,
         *,
         torsion: Torsion = "saint_venant",
-        shear_correction: Any = 1.0,
+        shear_correction: VectorLike = 1.0,
     ):
         self.semi_axis_y = _size("Elliptic", "semi_axis_y", semi_axis_y)
         self.semi_axis_z = _size("Elliptic", "semi_axis_z", semi_axis_z)
@@ -287,10 +293,10 @@ class Joined(Section):
     - `sections`: one more than `ends`, of any shapes.
     """
 
-    ends: Float[Array, " inner"] = in_unit("m")
+    ends: Float[Array, " inner"] = eqx.field(metadata={"unit": "m"})
     sections: tuple[Section, ...]
 
-    def __init__(self, ends: Any, sections: Sequence[Section]):
+    def __init__(self, ends: VectorLike, sections: Sequence[Section]):
         self.ends = rising_ends("Joined", ends, sections)
         self.sections = tuple(
             instance(f"Joined.sections[{i}]", s, Section, "a section")

@@ -1,19 +1,17 @@
 """Cubic not-a-knot splines. **Source:** C. de Boor, A Practical Guide to Splines, ch. IV."""
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from ..typing import Scalar
+from ..typing import Scalar, VectorLike
 from ..validation import concrete, numbers
 
 Points = Float[Array, " points"]
 
 
-def spline_points(name: str, value: Any) -> Points:
+def spline_points(name: str, value: VectorLike) -> Points:
     """`value` as the abscissas [m] of a spline: at least two, rising."""
     points = numbers(name, value, None)
     if points.ndim != 1 or points.size < 2:

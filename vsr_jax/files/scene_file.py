@@ -14,7 +14,7 @@ import inspect
 import re
 import tomllib
 import uuid
-from os import PathLike
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,9 +31,13 @@ from ..arm.rod import Rod
 from ..arm.routing import Helix, Linear, Parallel, Polynomial, Spline
 from ..arm.scene import Scene
 from ..arm.section import Annular, Circular, Elliptic, Joined, Rectangular
+from ..typing import PathLike, VectorLike
 from ..validation import concrete
 
 Group = dict[str, type]
+
+Table = dict[str, Any]
+"""A table of a TOML file."""
 
 
 def _group(*kinds: type) -> Group:
@@ -69,7 +73,7 @@ class SceneFile(NamedTuple):
     title: str = ""
 
 
-def load(path: str | PathLike[str]) -> SceneFile:
+def load(path: PathLike) -> SceneFile:
     """Reads a scene from a TOML file.
 
     Numbers take JAX's precision: for float64 set `jax_enable_x64` first.
@@ -98,7 +102,7 @@ def parse_scene(text: str) -> SceneFile:
     return parse_table(tomllib.loads(text), "")
 
 
-def parse_table(table: dict[str, Any], path: str) -> SceneFile:
+def parse_table(table: Table, path: str) -> SceneFile:
     """The scene in a table of a TOML file, which lies there under `path`.
 
     **Raises:** `ValueError` as `load`, without the file's name.
@@ -113,7 +117,7 @@ def parse_table(table: dict[str, Any], path: str) -> SceneFile:
     return SceneFile(scene, None if inputs is None else scene.check_inputs(inputs), title)
 
 
-def to_toml(scene: Scene, inputs: Any = None, title: str = "") -> str:
+def to_toml(scene: Scene, inputs: VectorLike | None = None, title: str = "") -> str:
     """A scene as TOML text, which `parse_scene` reads back to the last bit in the same precision.
 
     Arguments that have their default value are left out.
@@ -127,14 +131,14 @@ def to_toml(scene: Scene, inputs: Any = None, title: str = "") -> str:
     naming the place; for one that is traced by `jax.jit` or its kin; and for inputs that the scene
     refuses.
     """
-    head: dict[str, Any] = {"title": title} if title else {}
+    head: Table = {"title": title} if title else {}
     if inputs is not None:
         head["inputs"] = _numbers(scene.check_inputs(inputs), "inputs")
     text = tomli_w.dumps(head | _arguments(scene, ""))
     return _SHORT_LIST.sub(_on_one_line, text)
 
 
-def save(scene: Scene, path: str | PathLike[str], inputs: Any = None, title: str = "") -> None:
+def save(scene: Scene, path: PathLike, inputs: VectorLike | None = None, title: str = "") -> None:
     """Writes a scene to a TOML file, which `load` reads; see `to_toml` for the arguments and what
     is refused.
 
@@ -168,7 +172,7 @@ def _read(value: Any, path: str, group: Group) -> Any:
     return value
 
 
-def kind_of(table: dict[str, Any], path: str, group: Group) -> type:
+def kind_of(table: Table, path: str, group: Group) -> type:
     """The class that a table names in its `type`, one of a group."""
     known = ", ".join(sorted(group))
     if "type" not in table:
@@ -181,7 +185,7 @@ def kind_of(table: dict[str, Any], path: str, group: Group) -> type:
     return group[name]
 
 
-def _build(kind: type, table: dict[str, Any], path: str) -> Any:
+def _build(kind: type, table: Table, path: str) -> Any:
     check_keys(kind, table, path)
     given = {
         key: _read(value, _below(path, key), _GROUPS.get(key, _PROFILES))
@@ -193,7 +197,7 @@ def _build(kind: type, table: dict[str, Any], path: str) -> Any:
         raise ValueError(at(path, " ".join(str(error).split()))) from None
 
 
-def check_keys(kind: type, table: dict[str, Any], path: str, more: tuple[str, ...] = ()) -> None:
+def check_keys(kind: type, table: Table, path: str, more: tuple[str, ...] = ()) -> None:
     """Refuses keys that are no arguments of a class, and missing ones that are."""
     parameters = inspect.signature(kind).parameters
     known = sorted((*parameters, *more))
@@ -207,7 +211,7 @@ def check_keys(kind: type, table: dict[str, Any], path: str, more: tuple[str, ..
             raise ValueError(at(path, f"missing key {name!r}, known are {', '.join(known)}"))
 
 
-def _guess(name: Any, known: Any) -> str:
+def _guess(name: object, known: Iterable[str]) -> str:
     names = {candidate.lower(): candidate for candidate in known}
     close = difflib.get_close_matches(str(name).lower(), names, n=1)
     return f"; did you mean {names[close[0]]!r}?" if close else ""
@@ -222,7 +226,7 @@ def at(path: str, message: str) -> str:
     return f"{path}: {message}" if path else message
 
 
-def _arguments(value: Any, path: str) -> dict[str, Any]:
+def _arguments(value: Any, path: str) -> Table:
     table = {}
     for argument in arguments(value):
         name = argument.name
