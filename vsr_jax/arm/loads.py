@@ -1,9 +1,8 @@
-r"""External loads: wrenches per length along the arm and wrenches at points of it, dead or
-following.
+r"""External loads: wrenches per length along the arm and wrenches at points, dead or follower.
 
-A load is given in the world frame (dead: it keeps its direction) or in the body frame (follower: it
-turns with the section it acts on). Wrenches are angular first, $(c, f)$ [N m/m, N/m] per unit of
-reference length and $(M, F)$ [N m, N] at a point, moments about the point of the axis where the
+A load is given in the world frame (dead: its direction is constant) or in the body frame (follower:
+it rotates with its section). Wrenches have the angular part first, $(c, f)$ [N m/m, N/m] per
+reference length and $(M, F)$ [N m, N] at a point. Moments are about the point of the axis where the
 load acts.
 """
 
@@ -26,7 +25,7 @@ Frame = Literal["world", "body"]
 
 
 class Load(Part):
-    """A load on the arm: a wrench per length, or a wrench at a point, in the frame it keeps."""
+    """A load on the arm: a wrench per length or a wrench at a point, in the world or body frame."""
 
     frame: eqx.AbstractVar[Frame]
     effect: eqx.AbstractClassVar[str]
@@ -44,8 +43,7 @@ class Load(Part):
         return None
 
     def point(self, rod: Rod) -> tuple[Scalar, Wrench] | None:
-        """Where a load at a point acts [m] and its wrench $(M, F)$; None for a load along the
-        arm."""
+        """Abscissa [m] and wrench $(M, F)$ of a load at a point; None for a load per length."""
         return None
 
     def breakpoints(self, rod: Rod) -> tuple[Scalar, ...]:
@@ -54,13 +52,13 @@ class Load(Part):
 
 
 class Gravity(Load):
-    r"""Weight less buoyancy: $f = (\rho - \rho_f) A g$ per length, in the world frame.
+    r"""Weight minus buoyancy: $f = (\rho - \rho_f) A g$ per length, in the world frame.
 
     **Arguments:**
     - `acceleration`: $g$ [m/s^2] in the world frame, (0, 0, -9.81) by default.
-    - `fluid_density`: $\rho_f$ [kg/m^3] of a fluid around the arm, 0 by default. The arm is taken
-      as wet all round, its tip included, so that every slice is buoyed up by what it displaces at
-      rest.
+    - `fluid_density`: $\rho_f$ [kg/m^3] of a fluid around the arm, 0 by default. The fluid wets the
+      whole surface, the tip included, so that the buoyancy of every slice is the weight of the
+      fluid that it displaces at rest.
 
     The rod's material needs a `density`.
     """
@@ -107,9 +105,9 @@ class PointWrench(Load):
     """A force and a moment on the section at one abscissa.
 
     **Arguments:**
-    - `X`: where it acts [m], on the arm.
+    - `X`: abscissa where it acts [m], on the arm.
     - `force` [N], `moment` [N m]: three numbers each.
-    - `frame`: `"world"` for a dead wrench, `"body"` for one that follows the section.
+    - `frame`: `"world"` for a dead wrench, `"body"` for one that rotates with the section.
     """
 
     X: Scalar = eqx.field(metadata={"unit": "m"})
@@ -138,7 +136,7 @@ class PointWrench(Load):
 
 
 class TipWrench(Load):
-    """A force and a moment on the arm's end; arguments as for `PointWrench`."""
+    """A force and a moment at the arm's tip; arguments as for `PointWrench`."""
 
     force: Float[Array, "3"] = eqx.field(metadata={"unit": "N"})
     moment: Float[Array, "3"] = eqx.field(metadata={"unit": "N m"})
@@ -160,12 +158,12 @@ class TipWrench(Load):
 
 
 class DistributedWrench(Load):
-    """A force and a moment per unit of reference length.
+    """A force and a moment per reference length.
 
     **Arguments:**
     - `force` [N/m], `moment` [N m/m]: three profiles each (numbers, `Profile` or functions of X),
       or one function of X that returns three numbers.
-    - `frame`: `"world"` for a dead load, `"body"` for one that follows the sections.
+    - `frame`: `"world"` for a dead load, `"body"` for one that rotates with the sections.
     """
 
     force: tuple[Profile, ...] | FunctionOfX = eqx.field(metadata={"unit": "N/m"})

@@ -1,5 +1,5 @@
-r"""Materials: with a section they make the stiffness $\Sigma = \mathrm{diag}(G J_x, E J_y, E J_z, E
-A, \kappa_y G A, \kappa_z G A)$."""
+r"""Materials: with a section they define the stiffness $\Sigma = \mathrm{diag}(G J_x, E J_y, E
+J_z, E A, \kappa_y G A, \kappa_z G A)$."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,18 +11,17 @@ from .profile import Limits, Profile, ProfileLike, as_profile
 from .section import Section
 
 LEAST_POISSON, MOST_POISSON = -1.0, 0.5
-"""Poisson's ratio of a stable isotropic material is greater than the first and at most the
-second."""
+"""Range of Poisson's ratio of a stable isotropic material; the lower bound is excluded."""
 
 
 class Material(Part):
-    """Linear elastic material; its numbers may vary along the arm.
+    """Linear elastic material, uniform or varying along the arm.
 
     **Arguments**, each a profile (a number, a `Profile` or a function of X):
     - `young`: Young's modulus $E$ [Pa].
     - `shear` or `poisson`: the shear modulus $G$ [Pa], or Poisson's ratio $-1 < \\nu \\le 0.5$ [-]
-      for $G = E / (2 + 2\\nu)$; one of the two.
-    - `density`: $\\rho$ [kg/m^3], needed by `Gravity` only.
+      for $G = E / (2 + 2\\nu)$; exactly one of the two.
+    - `density`: $\\rho$ [kg/m^3], required only by `Gravity`.
     """
 
     young: Profile = eqx.field(metadata={"unit": "Pa"})
@@ -60,7 +59,7 @@ class Material(Part):
         return self.young(X, length) / (2 + 2 * self.poisson(X, length))
 
     def limits(self, X: Scalar, length: Scalar) -> Limits:
-        """The numbers at X [m] and what they have to keep to."""
+        """The properties at X [m] and their limits."""
         given = {
             name: p
             for name, p in (("young", self.young), ("shear", self.shear), ("density", self.density))
@@ -87,7 +86,7 @@ class Material(Part):
 
     @property
     def breakpoints(self) -> tuple[Scalar, ...]:
-        """Abscissas [m] where a number of the material or a derivative of it jumps."""
+        """Abscissas [m] where a property or one of its derivatives jumps."""
         profiles = [
             p for p in (self.young, self.shear, self.poisson, self.density) if p is not None
         ]

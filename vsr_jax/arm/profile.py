@@ -1,8 +1,8 @@
-"""Profiles: scalar functions of X along an arm, for sizes and rest strains.
+"""Profiles: scalar functions of X along an arm, for sizes, material properties and rest strains.
 
 A profile is called as `profile(X, length)` with scalars and is differentiable in both and in each
-of its numbers. Wherever a profile is expected a plain number means `Constant` and a Python function
-of X means `FunctionProfile`.
+of its numbers. Arguments that are profiles also accept a plain number, which is converted to
+`Constant`, and a Python function of X, which is converted to `FunctionProfile`.
 """
 
 import math
@@ -24,18 +24,17 @@ from .fields import OF_OWNER
 from .spline import spline_breakpoints, spline_points, spline_value
 
 Limits = dict[tuple[str, str], tuple[Array, Array]]
-"""Numbers that have limits, by their name and by what is needed of them; each with its room, how
-far it is inside of them."""
+"""Numbers that have limits: by name and requirement, the value and its distance to the limit, which
+is positive where the requirement is met."""
 
 
 class FunctionOfX(eqx.Module):
     """A user's function of X with parameters that can be differentiated.
 
     **Arguments:**
-    - `owner`: who asks for it, for error messages.
+    - `owner`: name of the class that takes the function, for error messages.
     - `function`: takes the scalar X [m] and the parameters; written with `jax.numpy`.
-    - `parameters`: any pytrees of arrays; derivatives with respect to them flow. An equinox module
-      may be one.
+    - `parameters`: pytrees of arrays, for example equinox modules; differentiable.
     """
 
     function: Callable = eqx.field(static=True)
@@ -50,7 +49,7 @@ class FunctionOfX(eqx.Module):
         )
 
     def __call__(self, X: Scalar) -> PyTree:
-        """Whatever the function returns at X [m]."""
+        """Value of the function at X [m]."""
         return self.function(X, *self.parameters)
 
     def __repr__(self) -> str:
@@ -67,7 +66,7 @@ class Profile(Part):
 
     @property
     def breakpoints(self) -> tuple[Scalar, ...]:
-        """Abscissas [m] where a derivative jumps: quadrature and steps break there."""
+        """Abscissas [m] where a derivative jumps. Quadrature intervals and steps end there."""
         return ()
 
 
@@ -106,7 +105,7 @@ class Taper(Profile):
 
 
 class PolynomialProfile(Profile):
-    """$f(X) = \\sum_i c_i X^i$, `coefficients` in rising order, units of $f$ per m^i."""
+    """$f(X) = \\sum_i c_i X^i$, `coefficients` in ascending order, in units of $f$ per m^i."""
 
     coefficients: Float[Array, " terms"] = eqx.field(metadata={"unit": OF_OWNER, "powers": True})
 
@@ -137,12 +136,12 @@ class SplineProfile(Profile):
 
 
 class Piecewise(Profile):
-    """One profile after another, with jumps between them.
+    """Consecutive profiles, with jumps between them.
 
     **Arguments:**
-    - `ends`: where each profile but the last ends [m], rising.
-    - `values`: profiles (or numbers, or functions of X), one more than `ends`. Each is a function
-      of X on the whole arm.
+    - `ends`: abscissas [m] where the profiles end, except the last; increasing.
+    - `values`: profiles (or numbers, or functions of X), one more than `ends`. The argument of each
+      is X from the base of the arm.
     """
 
     ends: Float[Array, " inner"] = eqx.field(metadata={"unit": "m"})
@@ -169,25 +168,25 @@ def rising_coefficients(name: str, value: VectorLike) -> Float[Array, " terms"]:
     """`value` as the coefficients of a polynomial, at least one."""
     array = numbers(name, value, None)
     if array.ndim != 1 or array.size == 0:
-        raise ValueError(f"{name}: got shape {array.shape}, need at least one number in a row")
+        raise ValueError(f"{name}: got shape {array.shape}, need an array of at least one number")
     return array
 
 
 def rising_ends(owner: str, ends: VectorLike, parts: Sequence[object]) -> Float[Array, " inner"]:
-    """Inner ends of `parts` laid one after another, checked."""
+    """Inner ends of consecutive `parts`, checked."""
     array = numbers(f"{owner}.ends", ends, None)
     known = concrete(array)
     if array.ndim != 1 or (known is not None and not np.all(np.diff(known, prepend=0.0) > 0)):
-        raise ValueError(f"{owner}.ends: got {ends!r}, need rising abscissas > 0 in a row")
+        raise ValueError(f"{owner}.ends: got {ends!r}, need an array of increasing abscissas > 0")
     if len(parts) != array.size + 1:
         raise ValueError(
-            f"{owner}: got {array.size} ends and {len(parts)} parts, need one part more than ends"
+            f"{owner}: got {array.size} ends and {len(parts)} parts, need one more part than ends"
         )
     return array
 
 
 def pick(X: Scalar, ends: Float[Array, " inner"], values: Sequence[Tree]) -> Tree:
-    """The one of `values`, numbers or pytrees of them, in whose part X lies."""
+    """The item of `values`, numbers or pytrees, for the part that contains X."""
     result = values[-1]
     for i in reversed(range(ends.size)):
         result = jax.tree.map(
@@ -197,8 +196,8 @@ def pick(X: Scalar, ends: Float[Array, " inner"], values: Sequence[Tree]) -> Tre
 
 
 class FunctionProfile(Profile):
-    """Any function of X: $f(X) =$ `function(X, *parameters)`, a scalar; see `FunctionOfX` for the
-    arguments."""
+    """Any function of X: $f(X) =$ `function(X, *parameters)`, a scalar. Arguments as for
+    `FunctionOfX`."""
 
     function: FunctionOfX
 
@@ -231,8 +230,8 @@ def as_profile(
     above: float = -math.inf,
     most: float = math.inf,
 ) -> Profile:
-    """`value` as a profile: a `Profile` itself, a function of X, or a number; its numbers within
-    limits, as for `numbers`."""
+    """`value` as a profile, from a `Profile`, a function of X or a number. The limits of
+    known numbers are checked as in `numbers`."""
     check = partial(numbers, positive=positive, above=above, most=most)
     if isinstance(value, Taper):
         check(f"{name} (Taper.base)", value.base)
@@ -256,11 +255,11 @@ _LINEAR_IN = {
     PolynomialProfile: ("coefficients",),
     SplineProfile: ("values",),
 }
-"""The fields that a profile is proportional to."""
+"""Fields in which a profile is linear."""
 
 
 def scaled(factor: float, profile: Profile) -> Profile:
-    """$c f(X)$, of the same kind as the profile where its own numbers can hold the factor."""
+    """$c f(X)$, of the same class as the profile if that is linear in its numbers."""
     if type(profile) is Piecewise:
         return Piecewise(profile.ends, [scaled(factor, part) for part in profile.values])
     if type(profile) not in _LINEAR_IN:

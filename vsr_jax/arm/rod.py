@@ -19,7 +19,7 @@ STRAINS = ("torsion", "bending_y", "bending_z", "elongation", "shear_y", "shear_
 """Names of the six strains $(k_x, k_y, k_z, u_x, u_y, u_z)$ in order."""
 
 STRAIGHT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
-"""Strains of a straight rod without shear, stretch and twist."""
+"""Strain of a straight rod without twist, stretch and shear."""
 
 
 _STRAIN_UNITS = ("1/m", "1/m", "1/m", "-", "-", "-")
@@ -30,14 +30,14 @@ class Rod(Part):
 
     **Arguments:**
     - `length`: $L$ [m].
-    - `section`, `material`: what makes its stiffness, see `Material.stiffness`.
+    - `section`, `material`: define the stiffness, see `Material.stiffness`.
     - `rest_strain`: $\\xi^*(X) = (k^*, u^*)$: six profiles (numbers, `Profile` or functions of X),
       or one function of X that returns six numbers. The default (0, 0, 0, 1, 0, 0) is straight. The
-      elongation $u_x^*$ has to be positive.
+      elongation $u_x^*$ must be positive.
     - `base`: pose of the section at X = 0, a rigid transform of shape (4, 4); the identity by
       default.
-    - `guide_radius`: threads are guided up to this radius [m] by discs wider than the section; by
-      default they run inside the section.
+    - `guide_radius`: radius [m] of discs that guide the threads outside the section; by default
+      the threads are inside the section.
     """
 
     length: Scalar = eqx.field(metadata={"unit": "m"})
@@ -84,7 +84,7 @@ class Rod(Part):
         return self.material.stiffness(self.section, X, self.length)
 
     def limits(self, X: Scalar) -> Limits:
-        """Sizes, material and rest elongation at X [m] and what they have to keep to."""
+        """Sizes, material properties and rest elongation at X [m] and their limits."""
         parts = {
             "section": self.section.limits(X, self.length),
             "material": self.material.limits(X, self.length),
@@ -104,7 +104,7 @@ class Rod(Part):
         }
 
     def clearance(self, y: Scalar, z: Scalar, X: Scalar) -> Array:
-        """How far (y, z) lies inside what guides threads at X: positive inside [m]."""
+        """Distance [m] from (y, z) to the section's wall or the guide at X: positive inside."""
         inside = self.section.clearance(y, z, X, self.length)
         return (
             inside
@@ -114,8 +114,8 @@ class Rod(Part):
 
     @property
     def breakpoints(self) -> tuple[Scalar, ...]:
-        """Abscissas [m] where a size, the material, the rest strain or a derivative of them
-        jumps."""
+        """Abscissas [m] where a size, a material property, the rest strain or one of their
+        derivatives jumps."""
         rest = () if isinstance(self.rest_strain, FunctionOfX) else self.rest_strain
         return (
             *self.section.breakpoints,

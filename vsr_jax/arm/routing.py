@@ -1,8 +1,7 @@
-"""Thread paths: where a thread crosses the sections, $d(X) = (0, d_y, d_z)$, in the section's
-frame.
+"""Thread paths: the position $d(X) = (0, d_y, d_z)$ of a thread in the section's frame.
 
-A routing is called as `routing(X)` with a scalar X [m] and returns (d_y, d_z) [m]; its derivatives
-are taken by forward differentiation, so a path is written down once.
+A routing is called as `routing(X)` with a scalar X [m] and returns (d_y, d_z) [m]. Its derivatives
+are computed by forward differentiation.
 """
 
 import math
@@ -24,8 +23,7 @@ from .spline import spline_breakpoints, spline_points, spline_value
 
 
 class Path(NamedTuple):
-    """One thread where it crosses the sections: position (d_y, d_z) [m] and slope (d_y', d_z')
-    [-]."""
+    """Position (d_y, d_z) [m] and slope (d_y', d_z') [-] of one thread."""
 
     y: Array
     z: Array
@@ -77,7 +75,7 @@ class Parallel(Routing):
 
 class Linear(Routing):
     """Straight and oblique (eq. 22): $d = (0, y + \\bar y X, z + \\bar z X)$, slopes $\\bar y,
-    \\bar z$ without unit."""
+    \\bar z$ [-]."""
 
     y: Scalar = eqx.field(metadata={"unit": "m"})
     z: Scalar = eqx.field(metadata={"unit": "m"})
@@ -103,9 +101,10 @@ class Helix(Routing):
     **Arguments:**
     - `radius`: $r$ [m], positive.
     - `angle` or `pitch`: the angle $\\alpha$ between path and cross-section [rad], at most $\\pi /
-      2$, or the pitch $p$ [m]; one of the two. With `angle` the pitch follows the radius.
+      2$, or the pitch $p$ [m]; exactly one of the two. With `angle` the pitch depends on the
+      radius.
     - `phase`: $\\phi_0$ [rad].
-    - `hand`: `"right"` winds from y towards z along the arm, `"left"` the other way.
+    - `hand`: `"right"` rotates from y to z along the arm, `"left"` from z to y.
     """
 
     radius: Scalar = eqx.field(metadata={"unit": "m"})
@@ -135,7 +134,7 @@ class Helix(Routing):
 
     @property
     def wavenumber(self) -> Scalar:
-        """$\\omega = 2 \\pi / p$ [rad/m], the rate at which the path turns about the axis."""
+        """$\\omega = 2 \\pi / p$ [rad/m], rate of rotation of the path about the axis."""
         if self.pitch is not None:
             return 2 * math.pi / self.pitch
         assert self.angle is not None
@@ -147,8 +146,8 @@ class Helix(Routing):
 
 
 class Polynomial(Routing):
-    """Polynomial path: $d_y = \\sum_i y_i X^i$, $d_z = \\sum_i z_i X^i$, coefficients in rising
-    order [m^(1-i)]."""
+    """Polynomial path: $d_y = \\sum_i y_i X^i$, $d_z = \\sum_i z_i X^i$, coefficients in
+    ascending order [m^(1-i)]."""
 
     y: Float[Array, " terms_y"] = eqx.field(metadata={"unit": "m", "powers": True})
     z: Float[Array, " terms_z"] = eqx.field(metadata={"unit": "m", "powers": True})
@@ -162,7 +161,7 @@ class Polynomial(Routing):
 
 
 class Spline(Routing):
-    """Cubic not-a-knot spline through the points (X, y, z), in metres, at least two."""
+    """Cubic not-a-knot spline through at least two points (X, y, z) [m]."""
 
     X: Float[Array, " points"] = eqx.field(metadata={"unit": "m"})
     y: Float[Array, " points"] = eqx.field(metadata={"unit": "m"})
@@ -182,7 +181,7 @@ class Spline(Routing):
 
 
 class Function(Routing):
-    """Any path: (d_y, d_z) = `function(X, *parameters)`, written with `jax.numpy`.
+    """A path given by a function: (d_y, d_z) = `function(X, *parameters)`, with `jax.numpy`.
 
     **Arguments:**
     - `function`: takes the scalar X [m] and the parameters, returns the pair (d_y, d_z) [m].

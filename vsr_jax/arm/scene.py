@@ -1,4 +1,4 @@
-"""A scene: a rod with its actuators and loads, and what they present to the models at each
+"""A scene: a rod with its actuators and loads, and the quantities that models need at each
 cross-section."""
 
 from collections.abc import Sequence
@@ -23,9 +23,9 @@ from .routing import Path, thread_tangent
 
 
 class CrossSections(NamedTuple):
-    r"""What a balance knows of the cross-sections at some X: the diagonal of $\Sigma$ (6), $\xi^*$
-    (6), each thread's `Path`, and whether the thread reaches there: 1 or 0, None for one that runs
-    along the whole arm."""
+    r"""Cross-sections at given X: the diagonal of $\Sigma$ (6), $\xi^*$ (6), the `Path` of each
+    thread, and its `reach`: 1 between its ends and 0 elsewhere, None if it extends over the whole
+    arm."""
 
     stiffness: Vector
     rest: Vector
@@ -33,31 +33,35 @@ class CrossSections(NamedTuple):
     reach: tuple[Array | None, ...]
 
     def carry(self, forces: Forces) -> Forces:
-        """Force of each thread here: that of its start where it reaches, none elsewhere."""
+        """Force of each thread here: equal to that at its start between its ends, else zero."""
         return shared(forces, self.reach)
 
 
 def shared(forces: Forces, shares: tuple[Array | None, ...]) -> Forces:
-    """Forces of threads, each times its share; None stands for all of it."""
+    """Forces of threads, each times its share; None means one."""
     return tuple(f if share is None else f * share for f, share in zip(forces, shares, strict=True))
 
 
 class Scene(Part):
-    """A rod, the actuators laid through it and the loads on it. Only what is present is computed.
+    """A rod with its actuators and loads. Effects that are absent are not computed.
 
     **Arguments:**
     - `rod`: the arm.
     - `actuators`: `Thread`, `Tendon` and `Chamber` in the order of the inputs.
     - `loads`: `Gravity`, `TipWrench`, `PointWrench` and `DistributedWrench`.
-    - `free_strains`: names of the strains that can change, all six by default; the others keep
-      their rest value and the solve has the size of those that are left. `("bending_y",
-      "bending_z")` is an inextensible rod without twist and shear.
+    - `free_strains`: names of the strains that can change, all six by default. The others equal
+      their rest value and are not unknowns of the solve. `("bending_y", "bending_z")` is an
+      inextensible rod without twist and shear.
 
-    **Raises:** `ValueError` if a thread leaves the section (or the rod's `guide_radius`), a size, a
-    modulus, a density or the rest elongation is not positive somewhere, a tube has no wall or
-    Poisson's ratio is out of its range, a thread ends or a load acts beyond the arm, or gravity
-    meets a material without density; numbers are looked at only while they are known, not under
-    `jax.jit`.
+    **Raises:** `ValueError` if
+
+    - a thread is outside the section (or the rod's `guide_radius`),
+    - a size, a modulus, a density or the rest elongation is not positive somewhere,
+    - a tube has no wall, or Poisson's ratio is out of its range,
+    - a thread ends or a load acts beyond the arm,
+    - there is gravity and the material has no density.
+
+    Only known numbers are checked, not those traced by `jax.jit`.
     """
 
     rod: Rod
@@ -105,8 +109,7 @@ class Scene(Part):
 
     @property
     def effects(self) -> tuple[str, ...]:
-        """What the scene calls for beyond a bare rod, in words; each costs something only when it
-        is named here."""
+        """Names of the effects of the scene beyond a bare rod. Other effects add no operations."""
         threads = [actuator.effects for actuator in self.actuators]
         loads = [load.effects for load in self.loads]
         names = [effects[0] for effects in (*threads, *loads)]
@@ -119,28 +122,28 @@ class Scene(Part):
 
     @property
     def free(self) -> tuple[int, ...]:
-        """Places of the free strains among the six."""
+        """Indices of the free strains among the six."""
         return tuple(STRAINS.index(name) for name in self.free_strains)
 
     @property
     def length_driven(self) -> tuple[int, ...]:
-        """Which actuators are driven by their length."""
+        """Indices of the actuators driven by their length."""
         return tuple(i for i, actuator in enumerate(self.actuators) if actuator.length_driven)
 
     @property
     def frictional(self) -> tuple[int, ...]:
-        """Which actuators have friction."""
+        """Indices of the actuators with friction."""
         return tuple(i for i, actuator in enumerate(self.actuators) if actuator.frictional)
 
     @property
     def coupled(self) -> bool:
-        """Whether the cross-sections depend on each other: through loads, a given thread length or
+        """Whether the cross-sections depend on each other: through loads, given thread lengths or
         friction."""
         return bool(self.loads or self.length_driven or self.frictional)
 
     @property
     def breakpoints(self) -> tuple[Scalar, ...]:
-        """Abscissas [m] where the strain or a derivative of it jumps."""
+        """Abscissas [m] where the strain or one of its derivatives jumps."""
         laid = [x for actuator in self.actuators for x in actuator.breakpoints]
         return (
             *self.rod.breakpoints,
@@ -167,14 +170,14 @@ class Scene(Part):
         return jax.tree.map(lambda leaf: leaf.reshape(X.shape), nodes)
 
     def forces(self, inputs: Float[Array, " inputs"]) -> Forces:
-        r"""Signed thread forces $\tau$ [N] for the inputs, one scalar a thread."""
+        r"""Signed thread forces $\tau$ [N] for the inputs, one scalar per thread."""
         return tuple(
             actuator.force(value) for actuator, value in zip(self.actuators, inputs, strict=True)
         )
 
     def density(self, X: Array, frame: Frame) -> Wrench | None:
-        """Load per length $(c, f)$ of all loads of a frame at abscissas X of any shape; None if the
-        scene has none."""
+        """Sum $(c, f)$ of the loads per length of a frame at abscissas X of any shape; None
+        if there are none."""
         total = None
         for load in self.loads:
             if load.frame != frame or load.point(self.rod) is not None:
@@ -197,9 +200,9 @@ class Scene(Part):
         return jnp.all(jnp.stack(checks)) if checks else jnp.array(True)
 
     def check_inputs(self, inputs: VectorLike) -> Float[Array, " inputs"]:
-        """`inputs` as an array, one number an actuator.
+        """`inputs` as an array, one number per actuator.
 
-        **Raises:** `ValueError` for a wrong number of inputs and, while their values are known, for
+        **Raises:** `ValueError` for a wrong number of inputs and, if their values are known, for
         NaN, infinities and values outside an actuator's range.
         """
         array = numbers("inputs", inputs, None, finite=False)
@@ -227,13 +230,13 @@ class Scene(Part):
             length = concrete(self.rest_length(i))
             if length is not None and not known[i] > -length:
                 raise ValueError(
-                    f"inputs[{i}]: got {known[i]:g}, need a change of length > {-length:g} m, all "
-                    f"that the tendon has"
+                    f"inputs[{i}]: got {known[i]:g}, need a change of length > {-length:g} m, the "
+                    f"negative of the tendon's length at rest"
                 )
         return array
 
     def rest_length(self, place: int) -> Scalar:
-        """Length of a thread's path in the arm at rest [m]."""
+        """Length of a thread's path at rest [m]."""
         return _rest_length(self, place)
 
     def astype(self, dtype: DTypeLike) -> "Scene":
@@ -261,13 +264,13 @@ class Scene(Part):
             j = int(np.argmin(values))
             if not values[j] > -ROUNDING * length:
                 raise ValueError(
-                    f"Scene.actuators[{i}].routing: the thread lies {-values[j]:.3g} m outside "
+                    f"Scene.actuators[{i}].routing: the thread is {-values[j]:.3g} m outside "
                     f"the section at X = {X[j]:g} m; "
                     "need a path inside the section (or give the rod a guide_radius)"
                 )
 
     def _check_places(self, length: float) -> None:
-        """Thread ends and point loads lie on the arm."""
+        """Raises `ValueError` if a thread end or a point load is beyond the arm."""
         beyond = length * (1 + ROUNDING)
         for i, actuator in enumerate(self.actuators):
             for name, x in (("start", actuator.start), ("end", actuator.end)):
@@ -307,8 +310,8 @@ def _rest_length(scene: Scene, place: int) -> Scalar:
 
 @eqx.filter_jit
 def _probe(scene: Scene) -> tuple[Array, Limits, list[Array]]:
-    """Places X [m] along the arm; there, the rod's numbers that have limits, and how far each
-    thread lies inside the section [m]."""
+    """Abscissas X [m] along the arm and, at each, the numbers of the rod that have limits and the
+    clearance of each thread [m]."""
     rod = scene.rod
     X = jnp.linspace(0, 1, 65) * rod.length
 

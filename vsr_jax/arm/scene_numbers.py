@@ -1,9 +1,8 @@
-"""The numbers of a scene by name, with their units: what sensitivities are told by and what a
-design is free to change.
+"""The numbers of a scene by name, with their units. Sensitivities and designs use these names.
 
-Names are the arguments of the constructors, as in a scene file: `rod.section.radius.base`,
-`actuators[0].routing.angle`, `loads[1].force`. A plain number that stands for a profile has the
-name of the argument (`rod.material.young`).
+Names consist of constructor arguments, as in a scene file: `rod.section.radius.base`,
+`actuators[0].routing.angle`, `loads[1].force`. A profile that is a plain number has the name of the
+argument (`rod.material.young`).
 """
 
 import dataclasses
@@ -48,14 +47,14 @@ class Parameter(NamedTuple):
 
 
 def parameters(scene: Scene) -> dict[str, Parameter]:
-    """Every number of a scene by its name: `value`, and `unit` where it is known."""
+    """Every number of a scene by its name: its `value`, and its `unit` if known."""
     return dict(_walk(scene, "", "", False, ()))
 
 
 def matching(pattern: str, known: Mapping[str, object]) -> list[str]:
-    """Names that a pattern stands for: `actuators[*].routing.radius` is the radius of each.
+    """Names that match a pattern: `actuators[*].routing.radius` matches the radius of each.
 
-    **Raises:** `ValueError` for a name that nothing has.
+    **Raises:** `ValueError` if no name matches.
     """
     form = re.compile(re.escape(pattern).replace(r"\[\*\]", r"\[\d+\]"))
     names = [name for name in known if form.fullmatch(name)]
@@ -67,7 +66,7 @@ def matching(pattern: str, known: Mapping[str, object]) -> list[str]:
 
 
 def replaced(scene: Scene, values: Mapping[str, Array]) -> Scene:
-    """The scene with other numbers under the given names."""
+    """The scene with new values of the named numbers."""
     known = parameters(scene)
     ways = [known[name].way for name in values]
     return (

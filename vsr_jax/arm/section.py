@@ -34,11 +34,11 @@ class Geometry(eqx.Module):
 
 
 class Section(Part):
-    """A cross-section whose sizes may vary along the arm.
+    """A cross-section, uniform or varying along the arm.
 
     **Arguments shared by the shapes:**
-    - `torsion`: `"saint_venant"` takes the torsion constant of the shape, `"polar"` the polar
-      moment $J_y + J_z$ (the paper's choice). Both agree for circular and annular sections.
+    - `torsion`: `"saint_venant"` is the torsion constant of the shape, `"polar"` the polar moment
+      $J_y + J_z$ (as in the paper). Both agree for circular and annular sections.
     - `shear_correction`: factors $(\\kappa_y, \\kappa_z)$ of the shear stiffness [-], one number
       for both; 1 in the paper.
     """
@@ -49,11 +49,11 @@ class Section(Part):
 
     @abstractmethod
     def clearance(self, y: Scalar, z: Scalar, X: Scalar, length: Scalar) -> Scalar:
-        """How far (y, z) lies inside the outer wall at X: positive inside, negative outside [m]."""
+        """Distance [m] from (y, z) to the outer wall at X: positive inside, negative outside."""
 
     @abstractmethod
     def outline(self, angle: Array, X: Scalar, length: Scalar) -> tuple[Array, Array]:
-        """Points (y, z) [m] of the outer wall at X, once round as `angle` [rad] goes from 0 (on the
+        """Points (y, z) [m] of the outer wall at X, a closed curve for `angle` [rad] from 0 (on the
         y axis) to 2 pi."""
 
     @property
@@ -62,13 +62,13 @@ class Section(Part):
         """The size profiles by name."""
 
     def limits(self, X: Scalar, length: Scalar) -> Limits:
-        """The sizes at X [m] and what they have to keep to."""
+        """The sizes at X [m] and their limits."""
         sizes = {name: size(X, length) for name, size in self.sizes.items()}
         return {(name, "a size > 0"): (size, size) for name, size in sizes.items()}
 
     @property
     def breakpoints(self) -> tuple[Scalar, ...]:
-        """Abscissas [m] where a size or a derivative of it jumps."""
+        """Abscissas [m] where a size or one of its derivatives jumps."""
         return tuple(x for size in self.sizes.values() for x in size.breakpoints)
 
 
@@ -86,7 +86,7 @@ def _options(torsion: Torsion, shear_correction: VectorLike) -> tuple[Torsion, F
 class Circular(Section):
     """Solid disc: $A = \\pi r^2$, $J_y = J_z = \\pi r^4 / 4$, $J_x = \\pi r^4 / 2$.
 
-    **Arguments:** `radius` or `diameter` [m], one of the two; the radius is what is kept.
+    **Arguments:** `radius` or `diameter` [m], exactly one of the two; the radius is stored.
     """
 
     radius: Profile = eqx.field(metadata={"unit": "m"})
@@ -182,8 +182,8 @@ class Rectangular(Section):
 
     The Saint-Venant constant with $a \ge b$ the sides is $\frac{a b^3}{3} \left(1 -
     \frac{192}{\pi^5} \frac b a \sum_{n\,odd} \frac{1}{n^5} \tanh\frac{n \pi a}{2 b}\right)$; the
-    part of the sum with tanh = 1 is exact, so nine terms reach rounding. **Source:** Timoshenko &
-    Goodier, Theory of Elasticity, art. 109.
+    part of the sum with tanh = 1 is exact, so nine terms are accurate to rounding. **Source:**
+    Timoshenko & Goodier, Theory of Elasticity, art. 109.
     """
 
     width: Profile = eqx.field(metadata={"unit": "m"})
@@ -286,11 +286,11 @@ class Elliptic(Section):
 
 
 class Joined(Section):
-    """One section after another along the arm, with jumps between them.
+    """Consecutive sections along the arm, with jumps between them.
 
     **Arguments:**
-    - `ends`: where each section but the last ends [m], rising.
-    - `sections`: one more than `ends`, of any shapes.
+    - `ends`: abscissas [m] where the sections end, except the last; increasing.
+    - `sections`: one more than `ends`, of any shape.
     """
 
     ends: Float[Array, " inner"] = eqx.field(metadata={"unit": "m"})

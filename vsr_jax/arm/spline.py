@@ -12,13 +12,15 @@ Points = Float[Array, " points"]
 
 
 def spline_points(name: str, value: VectorLike) -> Points:
-    """`value` as the abscissas [m] of a spline: at least two, rising."""
+    """`value` as the abscissas [m] of a spline: at least two, increasing."""
     points = numbers(name, value, None)
     if points.ndim != 1 or points.size < 2:
-        raise ValueError(f"{name}: got shape {points.shape}, need at least two abscissas in a row")
+        raise ValueError(
+            f"{name}: got shape {points.shape}, need an array of two abscissas or more"
+        )
     known = concrete(points)
     if known is not None and not np.all(np.diff(known) > 0):
-        raise ValueError(f"{name}: got {known.tolist()}, need rising abscissas")
+        raise ValueError(f"{name}: got {known.tolist()}, need increasing abscissas")
     return points
 
 

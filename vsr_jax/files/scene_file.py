@@ -1,9 +1,9 @@
 """Scenes as TOML files: every object is a table with `type = "Helix"` and the arguments of its
 constructor by name.
 
-The top of a file holds the arguments of `Scene` and, if wanted, a `title` and the `inputs`.
-Arguments keep the units of the constructors. Where only one class can stand (`rod`, `material`) the
-type may be left out, and where a profile is expected a plain number will do.
+The top level of a file contains the arguments of `Scene` and, optionally, a `title` and `inputs`.
+Units are those of the constructors. The type is optional where only one class is possible (`rod`,
+`material`). A profile can be a plain number.
 
 A new class needs an entry in its group below and a field for each argument of its constructor, of
 the same name. An argument without a field is read but not written, as `diameter` of `Circular`.
@@ -55,16 +55,16 @@ _GROUPS = {
     "actuators": _group(Thread, Tendon, Chamber),
     "loads": _group(Gravity, TipWrench, PointWrench, DistributedWrench),
 }
-"""Which classes can stand under a key; profiles under every other."""
+"""Classes that are possible under a key; profiles under every other key."""
 
 _FILE_KEYS = ("title", "inputs")
 _SHORT_LIST = re.compile(r"\[\n[^][{}]*\]")
 
 
 class SceneFile(NamedTuple):
-    """What a scene file holds.
+    """Contents of a scene file.
 
-    **Fields:** the `scene`; `inputs`, one number an actuator, None if the file gives none; the
+    **Fields:** the `scene`; `inputs`, one number per actuator, None if the file has none; the
     `title`, free text.
     """
 
@@ -76,15 +76,15 @@ class SceneFile(NamedTuple):
 def load(path: PathLike) -> SceneFile:
     """Reads a scene from a TOML file.
 
-    Numbers take JAX's precision: for float64 set `jax_enable_x64` first.
+    Numbers have JAX's default precision: for float64 set `jax_enable_x64` first.
 
-    **Arguments:** `path`: of the file.
+    **Arguments:** `path`: the file.
 
     **Returns:** a `SceneFile`: the scene, its inputs and its title.
 
-    **Raises:** `ValueError` of one line that begins with the file's name, if it cannot be read, is
-    no TOML (with line and column) or holds anything that is unknown, missing or refused by a
-    constructor (with the key's path).
+    **Raises:** `ValueError`, one line that starts with the file's name, if the file cannot be read,
+    is not TOML (with line and column) or has a key or value that is unknown, missing or rejected by
+    a constructor (with the key's path).
     """
     try:
         return parse_scene(Path(path).read_text(encoding="utf-8"))
@@ -103,7 +103,7 @@ def parse_scene(text: str) -> SceneFile:
 
 
 def parse_table(table: Table, path: str) -> SceneFile:
-    """The scene in a table of a TOML file, which lies there under `path`.
+    """The scene in a table of a TOML file; `path` is the path of the table's key.
 
     **Raises:** `ValueError` as `load`, without the file's name.
     """
@@ -118,18 +118,18 @@ def parse_table(table: Table, path: str) -> SceneFile:
 
 
 def to_toml(scene: Scene, inputs: VectorLike | None = None, title: str = "") -> str:
-    """A scene as TOML text, which `parse_scene` reads back to the last bit in the same precision.
+    """A scene as TOML text, which `parse_scene` reads back bit-identically in the same
+    precision.
 
-    Arguments that have their default value are left out.
+    Arguments with their default value are omitted.
 
     **Arguments:**
     - `scene`: the scene.
-    - `inputs`: one number an actuator, to be kept with it.
+    - `inputs`: one number per actuator, stored with the scene.
     - `title`: free text.
 
-    **Raises:** `ValueError` for a scene with Python functions in it or with classes of your own,
-    naming the place; for one that is traced by `jax.jit` or its kin; and for inputs that the scene
-    refuses.
+    **Raises:** `ValueError` for a scene with Python functions or user-defined classes, with their
+    path; for a scene traced by a JAX transformation such as `jax.jit`; and for invalid inputs.
     """
     head: Table = {"title": title} if title else {}
     if inputs is not None:
@@ -139,10 +139,9 @@ def to_toml(scene: Scene, inputs: VectorLike | None = None, title: str = "") -> 
 
 
 def save(scene: Scene, path: PathLike, inputs: VectorLike | None = None, title: str = "") -> None:
-    """Writes a scene to a TOML file, which `load` reads; see `to_toml` for the arguments and what
-    is refused.
+    """Writes a scene to a TOML file, which `load` reads. Arguments and errors as for `to_toml`.
 
-    The file is replaced as a whole, or not at all.
+    The write is atomic: an interrupted call leaves the previous file.
     """
     text, file = to_toml(scene, inputs, title), Path(path)
     part = file.with_name(f".{file.name}.{uuid.uuid4().hex}")
@@ -154,8 +153,8 @@ def save(scene: Scene, path: PathLike, inputs: VectorLike | None = None, title: 
 
 
 def _on_one_line(match: re.Match[str]) -> str:
-    # The writer breaks every list; text in quotes has no line breaks, those that there are lie
-    # between the items.
+    # The writer puts each item on a line of its own. Quoted text has no line breaks, so every line
+    # break is between items.
     return "[" + re.sub(r",?\n\s*", ", ", match[0][1:-1]).strip(", ") + "]"
 
 
@@ -173,7 +172,7 @@ def _read(value: Any, path: str, group: Group) -> Any:
 
 
 def kind_of(table: Table, path: str, group: Group) -> type:
-    """The class that a table names in its `type`, one of a group."""
+    """The class named by the `type` of a table, one of a group."""
     known = ", ".join(sorted(group))
     if "type" not in table:
         if len(group) == 1:
@@ -198,7 +197,7 @@ def _build(kind: type, table: Table, path: str) -> Any:
 
 
 def check_keys(kind: type, table: Table, path: str, more: tuple[str, ...] = ()) -> None:
-    """Refuses keys that are no arguments of a class, and missing ones that are."""
+    """Raises `ValueError` for keys that are not arguments of a class and for missing ones."""
     parameters = inspect.signature(kind).parameters
     known = sorted((*parameters, *more))
     for key in table:
@@ -222,7 +221,7 @@ def _below(path: str, key: str) -> str:
 
 
 def at(path: str, message: str) -> str:
-    """A message that begins with where it belongs."""
+    """A message with the path of its key in front."""
     return f"{path}: {message}" if path else message
 
 
@@ -248,7 +247,7 @@ def _write(value: Any, path: str, group: Group) -> Any:
     name = type(value).__name__
     if group.get(name) is not type(value):
         raise ValueError(
-            f"{path}: a {name} cannot be kept in a scene file; need one of "
+            f"{path}: a {name} cannot be stored in a scene file; need one of "
             f"{', '.join(sorted(group))}"
         )
     table = _arguments(value, path)
@@ -256,11 +255,10 @@ def _write(value: Any, path: str, group: Group) -> Any:
 
 
 def _numbers(value: Any, path: str) -> Any:
-    """Numbers as floats: the shortest decimals that give the same numbers in their own
-    precision."""
+    """Numbers as floats with the shortest decimals that are exact in the numbers' precision."""
     known = concrete(value)
     if known is None:
-        raise ValueError(f"{path}: a traced value cannot be kept in a scene file")
+        raise ValueError(f"{path}: a traced value cannot be stored in a scene file")
     return np.array([float(str(x)) for x in known.ravel()]).reshape(known.shape).tolist()
 
 
