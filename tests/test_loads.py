@@ -253,7 +253,7 @@ def test_a_turned_base_turns_dead_loads_the_other_way():
         ),
         (
             lambda: vsr.Piecewise([0.2, 0.1], [1.0, 2.0, 3.0]),
-            r"Piecewise\.ends: got \[0\.2, 0\.1\], need rising",
+            r"Piecewise\.ends: got \[0\.2, 0\.1\], need an array of increasing",
         ),
         (lambda: vsr.Joined([0.2], [ARM.section]), r"Joined: got 1 ends and 1 parts"),
     ],

@@ -96,9 +96,12 @@ def test_function_takes_parameters_that_can_be_differentiated():
             lambda: vsr.Parallel([0.1, 0.2], 0.0),
             r"Parallel\.y: got shape \(2,\), need a finite number",
         ),
-        (lambda: vsr.Spline([0.0, 0.5, 0.4], np.zeros(3), np.zeros(3)), "need rising abscissas"),
+        (
+            lambda: vsr.Spline([0.0, 0.5, 0.4], np.zeros(3), np.zeros(3)),
+            "increasing abscissas",
+        ),
         (lambda: vsr.Spline([0.0, 0.5], np.zeros(3), np.zeros(2)), r"Spline\.y: got shape \(3,\)"),
-        (lambda: vsr.Polynomial([], [0.0]), "need at least one number"),
+        (lambda: vsr.Polynomial([], [0.0]), "need an array of at least one number"),
         (lambda: vsr.Function(3.0), "need a function of X"),
     ],
 )

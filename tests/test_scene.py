@@ -39,6 +39,7 @@ def test_inputs_become_thread_forces():
         ({"a": 1.0}, "inputs: got .*need finite numbers"),
     ],
 )
+@pytest.mark.usefixtures("unchecked")
 def test_bad_inputs_are_named(inputs, message):
     with pytest.raises(ValueError, match=message):
         vsr.solve(SCENE, inputs)
@@ -69,7 +70,7 @@ def test_throw_raises_with_the_status_in_words():
     [
         (
             lambda: vsr.Scene(ARM, [vsr.Thread(vsr.Parallel(0.02, 0.0))]),
-            r"actuators\[0\]\.routing: the thread lies 0\.01 m outside the section",
+            r"actuators\[0\]\.routing: the thread is 0\.01 m outside the section",
         ),
         (
             lambda: vsr.Scene(ARM, [vsr.Thread(vsr.Linear(0.0, 0.0, 0.1))]),

@@ -154,7 +154,7 @@ class Zigzag(vsr.Parallel):
         (
             lambda s: s.rod.section.radius,
             vsr.FunctionProfile(lambda x: 0.01 + x),
-            r"^rod\.section\.radius: a FunctionProfile cannot be kept in a scene file; need one "
+            r"^rod\.section\.radius: a FunctionProfile cannot be stored in a scene file; need one "
             r"of Constant, Piecewise, .*, Taper$",
         ),
         (
@@ -165,12 +165,12 @@ class Zigzag(vsr.Parallel):
         (
             lambda s: s.actuators[0].routing,
             vsr.Function(lambda x: (x, x)),
-            r"^actuators\[0\]\.routing: a Function cannot be kept",
+            r"^actuators\[0\]\.routing: a Function cannot be stored",
         ),
         (
             lambda s: s.actuators[0].routing,
             Zigzag(0.0, 0.0),
-            r"^actuators\[0\]\.routing: a Zigzag cannot be kept",
+            r"^actuators\[0\]\.routing: a Zigzag cannot be stored",
         ),
     ],
     ids=["profile", "rest strain", "routing", "own class"],
@@ -181,7 +181,7 @@ def test_python_functions_and_own_classes_cannot_be_written(helix, where, part, 
 
 
 def test_traced_scenes_and_wrong_inputs_cannot_be_written(helix):
-    with pytest.raises(ValueError, match=r"rod\.length: a traced value cannot be kept"):
+    with pytest.raises(ValueError, match=r"rod\.length: a traced value cannot be stored"):
         eqx.filter_jit(to_toml)(helix)
     with pytest.raises(ValueError, match=r"inputs: got shape \(2,\), need \(1,\)"):
         to_toml(helix, [1.0, 2.0])
@@ -287,7 +287,7 @@ MISTAKES = [
     (
         "radius = 0.005",
         "radius = 0.05",
-        r"^Scene\.actuators\[0\]\.routing: the thread lies 0\.04 m outside the section at X = ",
+        r"^Scene\.actuators\[0\]\.routing: the thread is 0\.04 m outside the section at X = ",
     ),
     (
         "length = 0.75",

@@ -196,7 +196,7 @@ def test_a_python_function_is_a_profile():
             r"Material\.poisson \(Piecewise\.values\[1\]\): got",
         ),
         (lambda: vsr.Material(-1e6, shear=1e5), r"Material\.young: got -1000000\.0"),
-        (lambda: vsr.PolynomialProfile([[0.1]]), "need at least one number in a row"),
+        (lambda: vsr.PolynomialProfile([[0.1]]), "need an array of at least one number"),
         (lambda: vsr.Rod(0.0, vsr.Circular(0.01), STEEL), r"Rod\.length: got 0\.0"),
         (lambda: vsr.Rod(1.0, 0.01, STEEL), r"Rod\.section: got 0\.01, need a section"),
         (lambda: vsr.Rod(1.0, vsr.Circular(0.01), 2e11), r"Rod\.material: got .*, need a Material"),

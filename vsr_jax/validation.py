@@ -1,5 +1,5 @@
-"""Checks of what a user hands over: every refusal is a `ValueError` that names the argument, what
-came and what is needed."""
+"""Input validation: every error is a `ValueError` that names the argument, the value received and
+what is needed."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,21 +10,21 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 ROUNDING = 1e-6
-"""Share of an arm's length by which a place may lie beyond its ends: single precision may round
-up."""
+"""Tolerance of abscissas beyond an arm's ends, relative to its length, for rounding in single
+precision."""
 
 
 def is_traced(value: Any) -> bool:
-    """Whether only the shape of `value` is known, as under `jax.jit`."""
+    """Whether `value` is traced, as under `jax.jit`, so that only its shape is known."""
     return isinstance(value, Tracer)
 
 
 def concrete(value: Any) -> np.ndarray | None:
-    """`value` as a NumPy array, or None while it is traced (then only its shape is known)."""
+    """`value` as a NumPy array, or None if it is traced."""
     return None if is_traced(value) else np.asarray(value)
 
 
-def _refuse(name: str, value: Any, needed: str) -> ValueError:
+def _error(name: str, value: Any, needed: str) -> ValueError:
     return ValueError(f"{name}: got {value!r}, need {needed}")
 
 
@@ -39,9 +39,11 @@ def numbers(
     most: float = np.inf,
     finite: bool = True,
 ) -> Array:
-    """`value` as a floating-point array of `shape` (any shape for None). Where its numbers are
-    known: finite, `positive`, greater than `above`, at least `least` and at most `most`, as
-    wanted."""
+    """`value` as a floating-point array of `shape` (any shape for None).
+
+    Known numbers are checked: `finite`, `positive`, greater than `above`, at least `least` and at
+    most `most`.
+    """
     above = max(above, 0.0) if positive else above
     kind = (
         "a finite number"
@@ -57,13 +59,13 @@ def numbers(
     ]
     needed = f"{kind} {' and '.join(text for asked, text in limits if asked)}".rstrip()
     if isinstance(value, str):
-        raise _refuse(name, value, needed)
+        raise _error(name, value, needed)
     try:
         array = jnp.asarray(value)
     except (TypeError, ValueError):
-        raise _refuse(name, value, needed) from None
+        raise _error(name, value, needed) from None
     if jnp.issubdtype(array.dtype, jnp.complexfloating) or array.dtype == bool:
-        raise _refuse(name, value, needed)
+        raise _error(name, value, needed)
     array = (
         precise(name, array) if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(float)
     )
@@ -75,27 +77,27 @@ def numbers(
     if (finite and not np.all(np.isfinite(known))) or np.any(
         (known <= above) & (above > -np.inf) | (known < least) | (known > most)
     ):
-        raise _refuse(name, value, needed)
+        raise _error(name, value, needed)
     return array
 
 
 def precise(name: str, array: Array) -> Array:
-    """`array` if it is in single or double precision, in which alone equilibria can be found."""
+    """`array` if it is in single or double precision; the solvers support no other."""
     if array.dtype not in (jnp.float32, jnp.float64):
         raise ValueError(f"{name}: got {array.dtype}, need float32 or float64")
     return array
 
 
 def interval(name: str, pair: Any, size: int) -> tuple[Array, Array]:
-    """Least and greatest of `size` numbers, one an actuator, from a pair of numbers or arrays; in
-    order, where they are known."""
+    """Lower and upper bounds of `size` numbers, one per actuator, from a pair of numbers or arrays;
+    the order of known bounds is checked."""
     if not isinstance(pair, tuple | list) or len(pair) != 2:
-        raise _refuse(name, pair, "a pair, the least and the greatest inputs")
+        raise _error(name, pair, "a pair, the least and the greatest inputs")
     ends = [numbers(f"{name}[{i}]", end, None) for i, end in enumerate(pair)]
     for i, end in enumerate(ends):
         if end.shape not in ((), (size,)):
             raise ValueError(
-                f"{name}[{i}]: got shape {end.shape}, need one number or {size}, one an actuator"
+                f"{name}[{i}]: got shape {end.shape}, need one number or {size}, one per actuator"
             )
     low, high = (jnp.broadcast_to(end, (size,)) for end in ends)
     known = concrete(low), concrete(high)
@@ -105,10 +107,10 @@ def interval(name: str, pair: Any, size: int) -> tuple[Array, Array]:
 
 
 def rigid(name: str, value: Any) -> Array:
-    r"""`value` as a pose $((R, r), (0, 0, 0, 1))$, shape (4, 4), with $R^T R = 1$ and $\det R = 1$
-    where its numbers are known.
+    r"""`value` as a pose $((R, r), (0, 0, 0, 1))$, shape (4, 4). If its numbers are known,
+    $R^T R = 1$ and $\det R = 1$ are checked.
 
-    They may be off by 1e-5, in single precision by 1e-3, so that six digits are enough.
+    The tolerance is 1e-5, in single precision 1e-3, so that six digits are enough.
     """
     array = numbers(name, value, (4, 4))
     known = concrete(array)
@@ -119,14 +121,14 @@ def rigid(name: str, value: Any) -> Array:
     )
     if fault is not None:
         raise ValueError(
-            f"{name}: got {fault}, need a rigid transform, a rotation and a place over the row 0 "
-            f"0 0 1"
+            f"{name}: got {fault}, need a rigid transform, a rotation and a position above the "
+            f"row 0 0 0 1"
         )
     return array
 
 
 def _fault(g: np.ndarray, tolerance: float) -> str | None:
-    """Why a matrix is not a pose; None for a pose."""
+    """The property of a pose that a matrix lacks; None for a pose."""
     R, row = g[:3, :3], g[3]
     if np.max(np.abs(row - (0, 0, 0, 1))) > tolerance:
         return f"a last row of {' '.join(f'{x:g}' for x in row)}"
@@ -143,7 +145,7 @@ def _fault(g: np.ndarray, tolerance: float) -> str | None:
 def on_arm(
     name: str, X: Any, length: Any, ends: tuple[Any, Any] | None = None, what: str = "the arm"
 ) -> None:
-    """Refuses abscissas [m] beyond the arm, or beyond the `ends` of `what` lies along it, where all
+    """Raises `ValueError` for abscissas [m] beyond the arm, or beyond the `ends` of `what`, if all
     numbers are known."""
     low, high = (0.0, length) if ends is None else ends
     if any(is_traced(value) for value in (X, length, low, high)):
@@ -163,28 +165,28 @@ def positive(name: str, value: Any) -> float:
         or not isinstance(value, int | float | np.number | np.ndarray | Array)
         or is_traced(value)
     ):
-        raise _refuse(name, value, "a finite number > 0")
+        raise _error(name, value, "a finite number > 0")
     if np.ndim(value) or not (np.isfinite(value) and value > 0):
-        raise _refuse(name, value, "a finite number > 0")
+        raise _error(name, value, "a finite number > 0")
     return float(value)
 
 
 def count(name: str, value: Any, *, least: int = 1) -> int:
     """`value` as an integer of at least `least`."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise _refuse(name, value, f"an integer >= {least}")
+        raise _error(name, value, f"an integer >= {least}")
     return int(value)
 
 
 def choice(name: str, value: Any, allowed: Sequence[Any]) -> Any:
     """`value` if it is one of `allowed`."""
     if value not in allowed:
-        raise _refuse(name, value, "one of " + ", ".join(repr(a) for a in allowed))
+        raise _error(name, value, "one of " + ", ".join(repr(a) for a in allowed))
     return value
 
 
 def instance(name: str, value: Any, kind: type | tuple[type, ...], needed: str) -> Any:
-    """`value` if it is an instance of `kind`, which the message calls `needed`."""
+    """`value` if it is an instance of `kind`, described as `needed` in the message."""
     if not isinstance(value, kind):
-        raise _refuse(name, value, needed)
+        raise _error(name, value, needed)
     return value

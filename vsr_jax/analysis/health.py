@@ -20,7 +20,7 @@ from ..arm.rod import Rod
 from ..arm.scene import Scene
 from ..mechanics.balance import chosen, thread_direction, thread_wrench
 from ..models.base import Model, Status
-from ..numerics.component import Vector, norm, scale, split
+from ..numerics.component import Wrench, norm, scale, split
 from ..numerics.quadrature import make_grid
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
@@ -80,11 +80,11 @@ class _Share(Load):
     def __init__(self, load: Load, factor: Scalar):
         self.load, self.factor, self.frame = load, factor, load.frame
 
-    def density(self, rod: Rod, X: Scalar) -> Vector | None:
+    def density(self, rod: Rod, X: Scalar) -> Wrench | None:
         whole = self.load.density(rod, X)
         return None if whole is None else scale(self.factor, whole)
 
-    def point(self, rod: Rod) -> tuple[Scalar, Vector] | None:
+    def point(self, rod: Rod) -> tuple[Scalar, Wrench] | None:
         point = self.load.point(rod)
         return None if point is None else (point[0], scale(self.factor, point[1]))
 

@@ -1,7 +1,7 @@
-"""What an arm is made of: profiles, sections, materials, routings, actuators, loads, the rod, and
-the scene that joins them.
+"""Parts of an arm: profiles, sections, materials, routings, actuators, loads, the rod, and the
+scene that combines them.
 
-Data and their geometry only. Must not know how an equilibrium is found, nor how a scene is stored.
+Data and their geometry only. Must not know how an equilibrium is found or how a scene is stored.
 """
 
 from .actuator import Actuator, Chamber, Tendon, Thread

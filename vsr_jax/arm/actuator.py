@@ -1,25 +1,26 @@
-"""Actuators: what an input means as the paper's signed thread force $\\tau$ (negative pulls,
+"""Actuators: the relation of an input and the paper's signed thread force $\\tau$ (negative pulls,
 positive pushes)."""
 
 from abc import abstractmethod
-from typing import Any, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from ..typing import Scalar
+from ..typing import ArrayLike, Scalar
 from ..validation import choice, concrete, instance, numbers
+from .description import Part
 from .routing import Routing
 
 
-class Actuator(eqx.Module):
-    """A thread laid along a routing and driven by one input.
+class Actuator(Part):
+    """A thread along a routing, driven by one input.
 
     **Arguments shared by all:**
     - `routing`: the thread's path.
-    - `start`, `end`: where on the arm it is anchored [m], by default the arm's base and tip. It
-      acts between them only.
+    - `start`, `end`: abscissas of its anchors [m], by default the arm's base and tip. It acts only
+      between them.
     """
 
     routing: eqx.AbstractVar[Routing]
@@ -34,26 +35,40 @@ class Actuator(eqx.Module):
 
     @property
     def lowest(self) -> float:
-        """The least input it can take."""
+        """Smallest admissible input."""
         return float("-inf")
+
+    @property
+    def length_driven(self) -> bool:
+        """Whether the input is a change of length, so that the force is an unknown."""
+        return False
+
+    @property
+    def frictional(self) -> bool:
+        """Whether the force decays along the thread."""
+        return False
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """What the actuator adds to `Scene.effects`, its `effect` first."""
+        return (self.effect,)
 
     @abstractmethod
     def force(self, value: Scalar) -> Scalar:
         """Signed thread force $\\tau$ [N] for an input."""
 
     def admits(self, value: Scalar) -> Bool[Array, ""]:
-        """Whether the input is one this actuator can exert: finite and in its range."""
+        """Whether the input is finite and in the actuator's range."""
         return jnp.isfinite(value) & (value >= self.lowest)
 
     @property
     def breakpoints(self) -> tuple[Scalar, ...]:
-        """Abscissas [m] where the path, a derivative of it or the thread's force jumps."""
+        """Abscissas [m] where the path, one of its derivatives or the thread's force jumps."""
         ends = tuple(x for x in (self.start, self.end) if x is not None)
         return (*self.routing.breakpoints, *ends)
 
     def reach(self, X: Scalar) -> Array | None:
-        """1 where the thread lies, 0 beyond its ends; None for one that runs along the whole
-        arm."""
+        """1 between the thread's ends, 0 elsewhere; None if it extends over the whole arm."""
         if self.start is None and self.end is None:
             return None
         here = jnp.ones_like(X)
@@ -62,8 +77,8 @@ class Actuator(eqx.Module):
         return here if self.end is None else jnp.where(self.end > X, here, 0.0)
 
 
-def _laid(
-    actuator: str, routing: Any, start: Any, end: Any
+def _checked(
+    actuator: str, routing: Routing, start: ArrayLike | None, end: ArrayLike | None
 ) -> tuple[Routing, Scalar | None, Scalar | None]:
     needed = "a routing such as Parallel, Linear, Helix, Polynomial, Spline or Function"
     path = instance(f"{actuator}.routing", routing, Routing, needed)
@@ -84,12 +99,14 @@ class Thread(Actuator):
     fluidic chamber."""
 
     routing: Routing
-    start: Scalar | None
-    end: Scalar | None
+    start: Scalar | None = eqx.field(metadata={"unit": "m"})
+    end: Scalar | None = eqx.field(metadata={"unit": "m"})
     effect = "threads"
 
-    def __init__(self, routing: Routing, *, start: Any = None, end: Any = None):
-        self.routing, self.start, self.end = _laid("Thread", routing, start, end)
+    def __init__(
+        self, routing: Routing, *, start: ArrayLike | None = None, end: ArrayLike | None = None
+    ):
+        self.routing, self.start, self.end = _checked("Thread", routing, start, end)
 
     @property
     def unit(self) -> str:
@@ -100,11 +117,11 @@ class Thread(Actuator):
 
 
 class Tendon(Actuator):
-    r"""A cable that can only pull, driven by its tension or by its length.
+    r"""A cable that only pulls, driven by its tension or by its length.
 
     With `control="tension"` the input is $T \ge 0$ [N] and $\tau = -T$. With `control="length"` the
-    input is the change $\delta$ [m] of the cable between its ends, negative when the motor takes
-    cable in, and the tension is found:
+    input is the change of length $\delta$ [m] of the cable between its ends, negative when the
+    motor shortens it, and the tension is an unknown:
 
     $$T \ge 0, \quad (l^* + \delta)(1 + T / k) - l \ge 0, \quad \text{one of the two is zero},$$
 
@@ -113,10 +130,10 @@ class Tendon(Actuator):
 
     With friction the tension decays with the turning angle $\varphi$ of the cable from its start,
     $T(X) = T e^{\mp \mu \varphi(X)}$ (the capstan equation): minus while the motor pulls, plus
-    while it releases. The angle counts the kinks of the path: corners of its routing, and places
-    where the strain jumps, as where another tendon ends. There it converges by the order of the
-    nodes of a step, third for steps of order 6. The input and the tension found are those at the
-    start.
+    while it releases. The angle includes the kinks of the path: corners of its routing, and places
+    where the strain jumps, for example at the end of another tendon. With such kinks the order of
+    convergence is that of the nodes of a step, third for steps of order 6. The input and the
+    computed tension are those at the start.
 
     **Arguments:**
     - `routing`, `start`, `end`: as for every actuator.
@@ -127,10 +144,10 @@ class Tendon(Actuator):
     """
 
     routing: Routing
-    start: Scalar | None
-    end: Scalar | None
-    stiffness: Scalar | None
-    friction: Scalar | None
+    start: Scalar | None = eqx.field(metadata={"unit": "m"})
+    end: Scalar | None = eqx.field(metadata={"unit": "m"})
+    stiffness: Scalar | None = eqx.field(metadata={"unit": "N"})
+    friction: Scalar | None = eqx.field(metadata={"unit": "-"})
     control: Literal["tension", "length"] = eqx.field(static=True)
     motion: Literal["pull", "release"] = eqx.field(static=True)
     effect = "tendons"
@@ -139,19 +156,19 @@ class Tendon(Actuator):
         self,
         routing: Routing,
         *,
-        start: Any = None,
-        end: Any = None,
+        start: ArrayLike | None = None,
+        end: ArrayLike | None = None,
         control: Literal["tension", "length"] = "tension",
-        stiffness: Any = None,
-        friction: Any = None,
+        stiffness: ArrayLike | None = None,
+        friction: ArrayLike | None = None,
         motion: Literal["pull", "release"] = "pull",
     ):
-        self.routing, self.start, self.end = _laid("Tendon", routing, start, end)
+        self.routing, self.start, self.end = _checked("Tendon", routing, start, end)
         self.control = choice("Tendon.control", control, ("tension", "length"))
         if stiffness is not None and control == "tension":
             raise ValueError(
                 "Tendon.stiffness: got a stiffness with control='tension', need control='length' "
-                "(a given tension needs none)"
+                "(a given tension does not use it)"
             )
         self.stiffness = (
             None if stiffness is None else numbers("Tendon.stiffness", stiffness, positive=True)
@@ -167,30 +184,55 @@ class Tendon(Actuator):
 
     @property
     def lowest(self) -> float:
-        return 0.0 if self.control == "tension" else float("-inf")
+        return float("-inf") if self.length_driven else 0.0
+
+    @property
+    def length_driven(self) -> bool:
+        return self.control == "length"
+
+    @property
+    def frictional(self) -> bool:
+        return self.friction is not None
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        options = (
+            ("length control", self.length_driven),
+            ("elastic tendons", self.stiffness is not None),
+            ("friction", self.frictional),
+        )
+        return (self.effect, *(name for name, present in options if present))
 
     def force(self, value: Scalar) -> Scalar:
-        """$\\tau = -T$; a tendon driven by its length starts from none."""
+        """$\\tau = -T$; zero, the first iterate, for a tendon driven by its length."""
         return -value if self.control == "tension" else jnp.zeros_like(value)
 
 
 class Chamber(Actuator):
     """A slender fluidic chamber: the input is the gauge pressure $p$ [Pa], $\\tau = p a$.
+    A negative pressure is a vacuum.
 
     **Arguments:**
     - `routing`: the chamber's centre line.
-    - `area`: the chamber's bore $a$ [m^2], positive. A negative pressure is a vacuum.
+    - `area`: cross-sectional area $a$ of the chamber [m^2], positive.
     - `start`, `end`: as for every actuator.
     """
 
     routing: Routing
-    area: Scalar
-    start: Scalar | None
-    end: Scalar | None
+    area: Scalar = eqx.field(metadata={"unit": "m^2"})
+    start: Scalar | None = eqx.field(metadata={"unit": "m"})
+    end: Scalar | None = eqx.field(metadata={"unit": "m"})
     effect = "chambers"
 
-    def __init__(self, routing: Routing, area: Any, *, start: Any = None, end: Any = None):
-        self.routing, self.start, self.end = _laid("Chamber", routing, start, end)
+    def __init__(
+        self,
+        routing: Routing,
+        area: ArrayLike,
+        *,
+        start: ArrayLike | None = None,
+        end: ArrayLike | None = None,
+    ):
+        self.routing, self.start, self.end = _checked("Chamber", routing, start, end)
         self.area = numbers("Chamber.area", area, positive=True)
 
     @property

@@ -1,42 +1,49 @@
-r"""External loads: wrenches per length along the arm and wrenches at points of it, dead or
-following.
+r"""External loads: wrenches per length along the arm and wrenches at points, dead or follower.
 
-A load is given in the world frame (dead: it keeps its direction) or in the body frame (follower: it
-turns with the section it acts on). Wrenches are angular first, $(c, f)$ [N m/m, N/m] per unit of
-reference length and $(M, F)$ [N m, N] at a point, moments about the point of the axis where the
+A load is given in the world frame (dead: its direction is constant) or in the body frame (follower:
+it rotates with its section). Wrenches have the angular part first, $(c, f)$ [N m/m, N/m] per
+reference length and $(M, F)$ [N m, N] at a point. Moments are about the point of the axis where the
 load acts.
 """
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..numerics.component import Vector, split
-from ..typing import Scalar
+from ..numerics.component import Vector3, Wrench, split
+from ..typing import ArrayLike, Scalar, VectorLike
 from ..validation import choice, numbers
-from .profile import FunctionOfX, Profile, as_profile
+from .description import Part
+from .profile import FunctionOfX, Profile, ProfilesLike, as_profile
 from .rod import Rod
 
 Frame = Literal["world", "body"]
 
 
-class Load(eqx.Module):
-    """A load on the arm: a wrench per length, or a wrench at a point, in the frame it keeps."""
+class Load(Part):
+    """A load on the arm: a wrench per length or a wrench at a point, in the world or body frame."""
 
     frame: eqx.AbstractVar[Frame]
     effect: eqx.AbstractClassVar[str]
 
-    def density(self, rod: Rod, X: Scalar) -> Vector | None:
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """What the load adds to `Scene.effects`, its kind first."""
+        return (f"follower {self.effect}" if self.frame == "body" else self.effect,)
+
+    def check(self, rod: Rod) -> None:
+        """Raises `ValueError` if the load cannot act on `rod`. A scene calls this once."""
+
+    def density(self, rod: Rod, X: Scalar) -> Wrench | None:
         """Wrench per length $(c, f)$ at X, six scalars; None for a load at a point."""
         return None
 
-    def point(self, rod: Rod) -> tuple[Scalar, Vector] | None:
-        """Where a load at a point acts [m] and its wrench $(M, F)$; None for a load along the
-        arm."""
+    def point(self, rod: Rod) -> tuple[Scalar, Wrench] | None:
+        """Abscissa [m] and wrench $(M, F)$ of a load at a point; None for a load per length."""
         return None
 
     def breakpoints(self, rod: Rod) -> tuple[Scalar, ...]:
@@ -45,23 +52,25 @@ class Load(eqx.Module):
 
 
 class Gravity(Load):
-    r"""Weight less buoyancy: $f = (\rho - \rho_f) A g$ per length, in the world frame.
+    r"""Weight minus buoyancy: $f = (\rho - \rho_f) A g$ per length, in the world frame.
 
     **Arguments:**
     - `acceleration`: $g$ [m/s^2] in the world frame, (0, 0, -9.81) by default.
-    - `fluid_density`: $\rho_f$ [kg/m^3] of a fluid around the arm, 0 by default. The arm is taken
-      as wet all round, its tip included, so that every slice is buoyed up by what it displaces at
-      rest.
+    - `fluid_density`: $\rho_f$ [kg/m^3] of a fluid around the arm, 0 by default. The fluid wets the
+      whole surface, the tip included, so that the buoyancy of every slice is the weight of the
+      fluid that it displaces at rest.
 
     The rod's material needs a `density`.
     """
 
-    acceleration: Float[Array, "3"]
-    fluid_density: Scalar | None
+    acceleration: Float[Array, "3"] = eqx.field(metadata={"unit": "m/s^2"})
+    fluid_density: Scalar | None = eqx.field(metadata={"unit": "kg/m^3"})
     frame: Frame = eqx.field(static=True, default="world", init=False)
     effect = "gravity"
 
-    def __init__(self, acceleration: Any = (0.0, 0.0, -9.81), fluid_density: Any = None):
+    def __init__(
+        self, acceleration: VectorLike = (0.0, 0.0, -9.81), fluid_density: ArrayLike | None = None
+    ):
         self.acceleration = numbers("Gravity.acceleration", acceleration, (3,))
         self.fluid_density = (
             None
@@ -70,36 +79,48 @@ class Gravity(Load):
         )
         self.frame = "world"
 
-    def density(self, rod: Rod, X: Scalar) -> Vector:
-        assert rod.material.density is not None  # a Scene sees to it
+    @property
+    def effects(self) -> tuple[str, ...]:
+        return (self.effect,) if self.fluid_density is None else (self.effect, "buoyancy")
+
+    def check(self, rod: Rod) -> None:
+        if rod.material.density is None:
+            raise ValueError(
+                "Scene.loads: got a Gravity and a rod whose material has no density, need "
+                "Material(..., density=...)"
+            )
+
+    def density(self, rod: Rod, X: Scalar) -> Wrench:
+        assert rod.material.density is not None  # see check
         density = rod.material.density(X, rod.length)
         if self.fluid_density is not None:
             density = density - self.fluid_density
         weight = density * rod.section.geometry(X, rod.length).area
         zero = jnp.zeros_like(weight)
-        return (zero, zero, zero, *(weight * g for g in self.acceleration))
+        x, y, z = (weight * g for g in self.acceleration)
+        return zero, zero, zero, x, y, z
 
 
 class PointWrench(Load):
     """A force and a moment on the section at one abscissa.
 
     **Arguments:**
-    - `X`: where it acts [m], on the arm.
+    - `X`: abscissa where it acts [m], on the arm.
     - `force` [N], `moment` [N m]: three numbers each.
-    - `frame`: `"world"` for a dead wrench, `"body"` for one that follows the section.
+    - `frame`: `"world"` for a dead wrench, `"body"` for one that rotates with the section.
     """
 
-    X: Scalar
-    force: Float[Array, "3"]
-    moment: Float[Array, "3"]
+    X: Scalar = eqx.field(metadata={"unit": "m"})
+    force: Float[Array, "3"] = eqx.field(metadata={"unit": "N"})
+    moment: Float[Array, "3"] = eqx.field(metadata={"unit": "N m"})
     frame: Frame = eqx.field(static=True)
     effect = "point wrench"
 
     def __init__(
         self,
-        X: Any,
-        force: Any = (0.0, 0.0, 0.0),
-        moment: Any = (0.0, 0.0, 0.0),
+        X: ArrayLike,
+        force: VectorLike = (0.0, 0.0, 0.0),
+        moment: VectorLike = (0.0, 0.0, 0.0),
         frame: Frame = "world",
     ):
         self.X = numbers("PointWrench.X", X, least=0.0)
@@ -107,54 +128,60 @@ class PointWrench(Load):
         self.moment = numbers("PointWrench.moment", moment, (3,))
         self.frame = choice("PointWrench.frame", frame, ("world", "body"))
 
-    def point(self, rod: Rod) -> tuple[Scalar, Vector]:
-        return self.X, (*split(self.moment), *split(self.force))
+    def point(self, rod: Rod) -> tuple[Scalar, Wrench]:
+        return self.X, (*_three(self.moment), *_three(self.force))
 
     def breakpoints(self, rod: Rod) -> tuple[Scalar, ...]:
         return (self.X,)
 
 
 class TipWrench(Load):
-    """A force and a moment on the arm's end; arguments as for `PointWrench`."""
+    """A force and a moment at the arm's tip; arguments as for `PointWrench`."""
 
-    force: Float[Array, "3"]
-    moment: Float[Array, "3"]
+    force: Float[Array, "3"] = eqx.field(metadata={"unit": "N"})
+    moment: Float[Array, "3"] = eqx.field(metadata={"unit": "N m"})
     frame: Frame = eqx.field(static=True)
     effect = "tip wrench"
 
     def __init__(
-        self, force: Any = (0.0, 0.0, 0.0), moment: Any = (0.0, 0.0, 0.0), frame: Frame = "world"
+        self,
+        force: VectorLike = (0.0, 0.0, 0.0),
+        moment: VectorLike = (0.0, 0.0, 0.0),
+        frame: Frame = "world",
     ):
         self.force = numbers("TipWrench.force", force, (3,))
         self.moment = numbers("TipWrench.moment", moment, (3,))
         self.frame = choice("TipWrench.frame", frame, ("world", "body"))
 
-    def point(self, rod: Rod) -> tuple[Scalar, Vector]:
-        return rod.length, (*split(self.moment), *split(self.force))
+    def point(self, rod: Rod) -> tuple[Scalar, Wrench]:
+        return rod.length, (*_three(self.moment), *_three(self.force))
 
 
 class DistributedWrench(Load):
-    """A force and a moment per unit of reference length.
+    """A force and a moment per reference length.
 
     **Arguments:**
     - `force` [N/m], `moment` [N m/m]: three profiles each (numbers, `Profile` or functions of X),
       or one function of X that returns three numbers.
-    - `frame`: `"world"` for a dead load, `"body"` for one that follows the sections.
+    - `frame`: `"world"` for a dead load, `"body"` for one that rotates with the sections.
     """
 
-    force: tuple[Profile, ...] | FunctionOfX
-    moment: tuple[Profile, ...] | FunctionOfX
+    force: tuple[Profile, ...] | FunctionOfX = eqx.field(metadata={"unit": "N/m"})
+    moment: tuple[Profile, ...] | FunctionOfX = eqx.field(metadata={"unit": "N"})
     frame: Frame = eqx.field(static=True)
     effect = "distributed wrench"
 
     def __init__(
-        self, force: Any = (0.0, 0.0, 0.0), moment: Any = (0.0, 0.0, 0.0), frame: Frame = "world"
+        self,
+        force: ProfilesLike = (0.0, 0.0, 0.0),
+        moment: ProfilesLike = (0.0, 0.0, 0.0),
+        frame: Frame = "world",
     ):
         self.force = _three_profiles("DistributedWrench.force", force)
         self.moment = _three_profiles("DistributedWrench.moment", moment)
         self.frame = choice("DistributedWrench.frame", frame, ("world", "body"))
 
-    def density(self, rod: Rod, X: Scalar) -> Vector:
+    def density(self, rod: Rod, X: Scalar) -> Wrench:
         return (*_at(self.moment, rod, X), *_at(self.force, rod, X))
 
     def breakpoints(self, rod: Rod) -> tuple[Scalar, ...]:
@@ -167,7 +194,7 @@ class DistributedWrench(Load):
         return tuple(x for profile in profiles for x in profile.breakpoints)
 
 
-def _three_profiles(name: str, value: Any) -> tuple[Profile, ...] | FunctionOfX:
+def _three_profiles(name: str, value: ProfilesLike) -> tuple[Profile, ...] | FunctionOfX:
     if isinstance(value, FunctionOfX):
         return value
     if callable(value):
@@ -184,7 +211,14 @@ def _three_profiles(name: str, value: Any) -> tuple[Profile, ...] | FunctionOfX:
     return tuple(as_profile(f"{name}[{i}]", x) for i, x in enumerate(value))
 
 
-def _at(vector: tuple[Profile, ...] | FunctionOfX, rod: Rod, X: Scalar) -> Vector:
+def _at(vector: tuple[Profile, ...] | FunctionOfX, rod: Rod, X: Scalar) -> Vector3:
     if isinstance(vector, FunctionOfX):
-        return tuple(jnp.asarray(x, X.dtype) for x in vector(X))
-    return tuple(profile(X, rod.length) for profile in vector)
+        x, y, z = (jnp.asarray(value, X.dtype) for value in vector(X))
+    else:
+        x, y, z = (profile(X, rod.length) for profile in vector)
+    return x, y, z
+
+
+def _three(array: Float[Array, "3"]) -> Vector3:
+    x, y, z = split(array)
+    return x, y, z

@@ -1,37 +1,41 @@
-r"""Materials: with a section they make the stiffness $\Sigma = \mathrm{diag}(G J_x, E J_y, E J_z, E
-A, \kappa_y G A, \kappa_z G A)$."""
-
-from typing import Any
+r"""Materials: with a section they define the stiffness $\Sigma = \mathrm{diag}(G J_x, E J_y, E
+J_z, E A, \kappa_y G A, \kappa_z G A)$."""
 
 import equinox as eqx
 import jax.numpy as jnp
 
 from ..numerics.component import Vector
 from ..typing import Scalar
-from .profile import Limits, Profile, as_profile
+from .description import Part
+from .profile import Limits, Profile, ProfileLike, as_profile
 from .section import Section
 
 LEAST_POISSON, MOST_POISSON = -1.0, 0.5
-"""Poisson's ratio of a stable isotropic material is greater than the first and at most the
-second."""
+"""Range of Poisson's ratio of a stable isotropic material; the lower bound is excluded."""
 
 
-class Material(eqx.Module):
-    """Linear elastic material; its numbers may vary along the arm.
+class Material(Part):
+    """Linear elastic material, uniform or varying along the arm.
 
     **Arguments**, each a profile (a number, a `Profile` or a function of X):
     - `young`: Young's modulus $E$ [Pa].
     - `shear` or `poisson`: the shear modulus $G$ [Pa], or Poisson's ratio $-1 < \\nu \\le 0.5$ [-]
-      for $G = E / (2 + 2\\nu)$; one of the two.
-    - `density`: $\\rho$ [kg/m^3], needed by `Gravity` only.
+      for $G = E / (2 + 2\\nu)$; exactly one of the two.
+    - `density`: $\\rho$ [kg/m^3], required only by `Gravity`.
     """
 
-    young: Profile
-    shear: Profile | None
-    poisson: Profile | None
-    density: Profile | None
+    young: Profile = eqx.field(metadata={"unit": "Pa"})
+    shear: Profile | None = eqx.field(metadata={"unit": "Pa"})
+    poisson: Profile | None = eqx.field(metadata={"unit": "-"})
+    density: Profile | None = eqx.field(metadata={"unit": "kg/m^3"})
 
-    def __init__(self, young: Any, shear: Any = None, poisson: Any = None, density: Any = None):
+    def __init__(
+        self,
+        young: ProfileLike,
+        shear: ProfileLike | None = None,
+        poisson: ProfileLike | None = None,
+        density: ProfileLike | None = None,
+    ):
         if (shear is None) == (poisson is None):
             raise ValueError(
                 f"Material: got shear={shear!r} and poisson={poisson!r}, need one of the two"
@@ -55,7 +59,7 @@ class Material(eqx.Module):
         return self.young(X, length) / (2 + 2 * self.poisson(X, length))
 
     def limits(self, X: Scalar, length: Scalar) -> Limits:
-        """The numbers at X [m] and what they have to keep to."""
+        """The properties at X [m] and their limits."""
         given = {
             name: p
             for name, p in (("young", self.young), ("shear", self.shear), ("density", self.density))
@@ -82,7 +86,7 @@ class Material(eqx.Module):
 
     @property
     def breakpoints(self) -> tuple[Scalar, ...]:
-        """Abscissas [m] where a number of the material or a derivative of it jumps."""
+        """Abscissas [m] where a property or one of its derivatives jumps."""
         profiles = [
             p for p in (self.young, self.shear, self.poisson, self.density) if p is not None
         ]

@@ -1,44 +1,46 @@
-"""Profiles: scalar functions of X along an arm, for sizes and rest strains.
+"""Profiles: scalar functions of X along an arm, for sizes, material properties and rest strains.
 
 A profile is called as `profile(X, length)` with scalars and is differentiable in both and in each
-of its numbers. Wherever a profile is expected a plain number means `Constant` and a Python function
-of X means `FunctionProfile`.
+of its numbers. Arguments that are profiles also accept a plain number, which is converted to
+`Constant`, and a Python function of X, which is converted to `FunctionProfile`.
 """
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
+from functools import partial
 from operator import attrgetter
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
-from ..typing import Scalar
+from ..typing import ArrayLike, Scalar, Tree, VectorLike
 from ..validation import concrete, numbers
+from .description import Part, describe
+from .fields import OF_OWNER
+from .spline import spline_breakpoints, spline_points, spline_value
 
 Limits = dict[tuple[str, str], tuple[Array, Array]]
-"""Numbers that have limits, by their name and by what is needed of them; each with its room, how
-far it is inside of them."""
+"""Numbers that have limits: by name and requirement, the value and its distance to the limit, which
+is positive where the requirement is met."""
 
 
 class FunctionOfX(eqx.Module):
     """A user's function of X with parameters that can be differentiated.
 
     **Arguments:**
-    - `owner`: who asks for it, for error messages.
+    - `owner`: name of the class that takes the function, for error messages.
     - `function`: takes the scalar X [m] and the parameters; written with `jax.numpy`.
-    - `parameters`: any pytrees of arrays; derivatives with respect to them flow. An equinox module
-      may be one.
+    - `parameters`: pytrees of arrays, for example equinox modules; differentiable.
     """
 
     function: Callable = eqx.field(static=True)
     parameters: tuple
 
-    def __init__(self, owner: str, function: Callable, *parameters: Any):
+    def __init__(self, owner: str, function: Callable, *parameters: PyTree):
         if not callable(function):
             raise ValueError(f"{owner}.function: got {function!r}, need a function of X")
         self.function = function
@@ -46,12 +48,16 @@ class FunctionOfX(eqx.Module):
             lambda leaf: jnp.asarray(leaf) if eqx.is_array_like(leaf) else leaf, parameters
         )
 
-    def __call__(self, X: Scalar) -> Any:
-        """Whatever the function returns at X [m]."""
+    def __call__(self, X: Scalar) -> PyTree:
+        """Value of the function at X [m]."""
         return self.function(X, *self.parameters)
 
+    def __repr__(self) -> str:
+        name = getattr(self.function, "__name__", type(self.function).__name__)
+        return f"{name}({', '.join(('X', *map(describe, self.parameters)))})"
 
-class Profile(eqx.Module):
+
+class Profile(Part):
     """A scalar function of X on an arm of a given length."""
 
     @abstractmethod
@@ -60,16 +66,24 @@ class Profile(eqx.Module):
 
     @property
     def breakpoints(self) -> tuple[Scalar, ...]:
-        """Abscissas [m] where a derivative jumps: quadrature and steps break there."""
+        """Abscissas [m] where a derivative jumps. Quadrature intervals and steps end there."""
         return ()
+
+
+ProfileLike = Profile | ArrayLike | Callable[..., ArrayLike]
+"""What is converted to a profile: a number, or a function of X."""
+
+ProfilesLike = ArrayLike | Sequence[ProfileLike] | Callable[..., Sequence[ArrayLike] | Array]
+"""What is converted to several profiles: one for each, or one function of X that returns a number
+for each."""
 
 
 class Constant(Profile):
     """$f(X) = c$."""
 
-    value: Scalar
+    value: Scalar = eqx.field(metadata={"unit": OF_OWNER, "named": False})
 
-    def __init__(self, value: Any):
+    def __init__(self, value: ArrayLike):
         self.value = numbers("Constant.value", value)
 
     def __call__(self, X: Scalar, length: Scalar) -> Scalar:
@@ -79,10 +93,10 @@ class Constant(Profile):
 class Taper(Profile):
     """$f(X) = f_b + (f_t - f_b) X / L$: from `base` at X = 0 to `tip` at X = L."""
 
-    base: Scalar
-    tip: Scalar
+    base: Scalar = eqx.field(metadata={"unit": OF_OWNER})
+    tip: Scalar = eqx.field(metadata={"unit": OF_OWNER})
 
-    def __init__(self, base: Any, tip: Any):
+    def __init__(self, base: ArrayLike, tip: ArrayLike):
         self.base = numbers("Taper.base", base)
         self.tip = numbers("Taper.tip", tip)
 
@@ -91,115 +105,49 @@ class Taper(Profile):
 
 
 class PolynomialProfile(Profile):
-    """$f(X) = \\sum_i c_i X^i$, `coefficients` in rising order, units of $f$ per m^i."""
+    """$f(X) = \\sum_i c_i X^i$, `coefficients` in ascending order, in units of $f$ per m^i."""
 
-    coefficients: Float[Array, " terms"]
+    coefficients: Float[Array, " terms"] = eqx.field(metadata={"unit": OF_OWNER, "powers": True})
 
-    def __init__(self, coefficients: Any):
-        self.coefficients = numbers("PolynomialProfile.coefficients", coefficients, None)
-        if self.coefficients.ndim != 1 or self.coefficients.size == 0:
-            raise ValueError(
-                f"PolynomialProfile.coefficients: got shape {self.coefficients.shape}, need at "
-                f"least one number in a row"
-            )
+    def __init__(self, coefficients: VectorLike):
+        self.coefficients = rising_coefficients("PolynomialProfile.coefficients", coefficients)
 
     def __call__(self, X: Scalar, length: Scalar) -> Scalar:
         return jnp.polyval(self.coefficients[::-1], X)
 
 
 class SplineProfile(Profile):
-    """Cubic not-a-knot spline through `values` at the abscissas `X` [m].
+    """Cubic not-a-knot spline through `values` at the abscissas `X` [m], see
+    `spline_value`."""
 
-    Two points give the straight line and three the parabola through them. Beyond the first and last
-    point the end pieces go on. **Source:** C. de Boor, A Practical Guide to Splines, ch. IV.
-    """
+    X: Float[Array, " points"] = eqx.field(metadata={"unit": "m"})
+    values: Float[Array, " points"] = eqx.field(metadata={"unit": OF_OWNER})
 
-    X: Float[Array, " points"]
-    values: Float[Array, " points"]
-
-    def __init__(self, X: Any, values: Any):
-        self.X = numbers("SplineProfile.X", X, None)
+    def __init__(self, X: VectorLike, values: VectorLike):
+        self.X = spline_points("SplineProfile.X", X)
         self.values = numbers("SplineProfile.values", values, self.X.shape)
-        if self.X.ndim != 1 or self.X.size < 2:
-            raise ValueError(
-                f"SplineProfile.X: got shape {self.X.shape}, need at least two abscissas in a row"
-            )
-        known = concrete(self.X)
-        if known is not None and not np.all(np.diff(known) > 0):
-            raise ValueError(f"SplineProfile.X: got {known.tolist()}, need rising abscissas")
 
     @property
     def breakpoints(self) -> tuple[Scalar, ...]:
-        return tuple(self.X[i] for i in range(2, self.X.size - 2))
-
-    def _slopes(self) -> Float[Array, " points"]:
-        x, h = self.X, jnp.diff(self.X)
-        secant = jnp.diff(self.values) / h
-        n = x.size
-        if n == 2:
-            return jnp.stack([secant[0], secant[0]])
-        if n == 3:
-            second = (secant[1] - secant[0]) / (x[2] - x[0])
-            return jnp.stack(
-                [secant[0] - second * h[0], secant[0] + second * h[0], secant[1] + second * h[1]]
-            )
-        inner = 3 * (h[1:] * secant[:-1] + h[:-1] * secant[1:])
-        ends = []
-        for (p, q), (s, t) in ((h[:2], secant[:2]), (h[-2:][::-1], secant[-2:][::-1])):
-            ends.append((q, p + q, ((p + 2 * (p + q)) * q * s + p**2 * t) / (p + q)))
-        (first, above, start), (last, below, end) = ends
-        lower = jnp.concatenate([jnp.zeros(1, x.dtype), h[1:], below[None]])
-        diagonal = jnp.concatenate([first[None], 2 * (h[:-1] + h[1:]), last[None]])
-        upper = jnp.concatenate([above[None], h[:-1], jnp.zeros(1, x.dtype)])
-        return _tridiagonal(
-            lower, diagonal, upper, jnp.concatenate([start[None], inner, end[None]])
-        )
+        return spline_breakpoints(self.X)
 
     def __call__(self, X: Scalar, length: Scalar) -> Scalar:
-        slopes = self._slopes()
-        i = jnp.clip(jnp.searchsorted(self.X, X, side="right") - 1, 0, self.X.size - 2)
-        h = self.X[i + 1] - self.X[i]
-        s = (X - self.X[i]) / h
-        secant = (self.values[i + 1] - self.values[i]) / h
-        d0, d1 = slopes[i], slopes[i + 1]
-        return self.values[i] + h * s * (
-            d0 + s * ((3 * secant - 2 * d0 - d1) + s * (d0 + d1 - 2 * secant))
-        )
-
-
-def _tridiagonal(lower: Array, diagonal: Array, upper: Array, right: Array) -> Array:
-    """Solution by elimination without pivots, whose order the rows of a spline do not need."""
-
-    def down(
-        above: tuple[Array, Array], row: tuple[Array, Array, Array, Array]
-    ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        (ratio, value), (left, middle, beyond, side) = above, row
-        pivot = middle - left * ratio
-        here = beyond / pivot, (side - left * value) / pivot
-        return here, here
-
-    def up(after: Array, row: tuple[Array, Array]) -> tuple[Array, Array]:
-        here = row[1] - row[0] * after
-        return here, here
-
-    zero = jnp.zeros((), right.dtype)
-    _, rows = lax.scan(down, (zero, zero), (lower, diagonal, upper, right))
-    return lax.scan(up, zero, rows, reverse=True)[1]
+        return spline_value(X, self.X, self.values)
 
 
 class Piecewise(Profile):
-    """One profile after another, with jumps between them.
+    """Consecutive profiles, with jumps between them.
 
     **Arguments:**
-    - `ends`: where each profile but the last ends [m], rising.
-    - `values`: profiles (or numbers, or functions of X), one more than `ends`. Each is a function
-      of X on the whole arm.
+    - `ends`: abscissas [m] where the profiles end, except the last; increasing.
+    - `values`: profiles (or numbers, or functions of X), one more than `ends`. The argument of each
+      is X from the base of the arm.
     """
 
-    ends: Float[Array, " inner"]
-    values: tuple[Profile, ...]
+    ends: Float[Array, " inner"] = eqx.field(metadata={"unit": "m"})
+    values: tuple[Profile, ...] = eqx.field(metadata={"unit": OF_OWNER})
 
-    def __init__(self, ends: Any, values: Sequence[Any]):
+    def __init__(self, ends: VectorLike, values: Sequence[ProfileLike]):
         self.ends = rising_ends("Piecewise", ends, values)
         self.values = tuple(
             as_profile(f"Piecewise.values[{i}]", value) for i, value in enumerate(values)
@@ -216,21 +164,29 @@ class Piecewise(Profile):
         )
 
 
-def rising_ends(owner: str, ends: Any, parts: Sequence[Any]) -> Float[Array, " inner"]:
-    """Inner ends of `parts` laid one after another, checked."""
+def rising_coefficients(name: str, value: VectorLike) -> Float[Array, " terms"]:
+    """`value` as the coefficients of a polynomial, at least one."""
+    array = numbers(name, value, None)
+    if array.ndim != 1 or array.size == 0:
+        raise ValueError(f"{name}: got shape {array.shape}, need an array of at least one number")
+    return array
+
+
+def rising_ends(owner: str, ends: VectorLike, parts: Sequence[object]) -> Float[Array, " inner"]:
+    """Inner ends of consecutive `parts`, checked."""
     array = numbers(f"{owner}.ends", ends, None)
     known = concrete(array)
     if array.ndim != 1 or (known is not None and not np.all(np.diff(known, prepend=0.0) > 0)):
-        raise ValueError(f"{owner}.ends: got {ends!r}, need rising abscissas > 0 in a row")
+        raise ValueError(f"{owner}.ends: got {ends!r}, need an array of increasing abscissas > 0")
     if len(parts) != array.size + 1:
         raise ValueError(
-            f"{owner}: got {array.size} ends and {len(parts)} parts, need one part more than ends"
+            f"{owner}: got {array.size} ends and {len(parts)} parts, need one more part than ends"
         )
     return array
 
 
-def pick(X: Scalar, ends: Float[Array, " inner"], values: Sequence[Any]) -> Any:
-    """The one of `values`, numbers or pytrees of them, in whose part X lies."""
+def pick(X: Scalar, ends: Float[Array, " inner"], values: Sequence[Tree]) -> Tree:
+    """The item of `values`, numbers or pytrees, for the part that contains X."""
     result = values[-1]
     for i in reversed(range(ends.size)):
         result = jax.tree.map(
@@ -240,12 +196,12 @@ def pick(X: Scalar, ends: Float[Array, " inner"], values: Sequence[Any]) -> Any:
 
 
 class FunctionProfile(Profile):
-    """Any function of X: $f(X) =$ `function(X, *parameters)`, a scalar; see `FunctionOfX` for the
-    arguments."""
+    """Any function of X: $f(X) =$ `function(X, *parameters)`, a scalar. Arguments as for
+    `FunctionOfX`."""
 
     function: FunctionOfX
 
-    def __init__(self, function: Callable, *parameters: Any):
+    def __init__(self, function: Callable[..., ArrayLike], *parameters: PyTree):
         self.function = FunctionOfX("FunctionProfile", function, *parameters)
 
     def __call__(self, X: Scalar, length: Scalar) -> Scalar:
@@ -256,7 +212,7 @@ class _Scaled(Profile):
     """A factor times a profile."""
 
     factor: float = eqx.field(static=True)
-    profile: Profile
+    profile: Profile = eqx.field(metadata={"unit": OF_OWNER})
 
     def __call__(self, X: Scalar, length: Scalar) -> Scalar:
         return self.factor * self.profile(X, length)
@@ -266,22 +222,31 @@ class _Scaled(Profile):
         return self.profile.breakpoints
 
 
-def as_profile(name: str, value: Any, **limits: Any) -> Profile:
-    """`value` as a profile: a `Profile` itself, a function of X, or a number; its numbers within
-    `limits`, as for `numbers`."""
+def as_profile(
+    name: str,
+    value: ProfileLike,
+    *,
+    positive: bool = False,
+    above: float = -math.inf,
+    most: float = math.inf,
+) -> Profile:
+    """`value` as a profile, from a `Profile`, a function of X or a number. The limits of
+    known numbers are checked as in `numbers`."""
+    check = partial(numbers, positive=positive, above=above, most=most)
     if isinstance(value, Taper):
-        numbers(f"{name} (Taper.base)", value.base, **limits)
-        numbers(f"{name} (Taper.tip)", value.tip, **limits)
+        check(f"{name} (Taper.base)", value.base)
+        check(f"{name} (Taper.tip)", value.tip)
     if isinstance(value, Constant):
-        numbers(name, value.value, **limits)
-    if isinstance(value, Piecewise) and limits:
+        check(name, value.value)
+    if isinstance(value, Piecewise):
         for i, part in enumerate(value.values):
-            as_profile(f"{name} (Piecewise.values[{i}])", part, **limits)
+            label = f"{name} (Piecewise.values[{i}])"
+            as_profile(label, part, positive=positive, above=above, most=most)
     if isinstance(value, Profile):
         return value
     if callable(value):
         return FunctionProfile(value)
-    return Constant(numbers(name, value, **limits))
+    return Constant(check(name, value))
 
 
 _LINEAR_IN = {
@@ -290,11 +255,11 @@ _LINEAR_IN = {
     PolynomialProfile: ("coefficients",),
     SplineProfile: ("values",),
 }
-"""The fields that a profile is proportional to."""
+"""Fields in which a profile is linear."""
 
 
 def scaled(factor: float, profile: Profile) -> Profile:
-    """$c f(X)$, of the same kind as the profile where its own numbers can hold the factor."""
+    """$c f(X)$, of the same class as the profile if that is linear in its numbers."""
     if type(profile) is Piecewise:
         return Piecewise(profile.ends, [scaled(factor, part) for part in profile.values])
     if type(profile) not in _LINEAR_IN:

@@ -1,7 +1,6 @@
 """The rod: a slender arm with its section, material, rest strain and base."""
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,49 +8,54 @@ import numpy as np
 from jaxtyping import Array
 
 from ..numerics.component import Vector, norm
-from ..typing import Pose, Scalar
+from ..typing import ArrayLike, MatrixLike, Pose, Scalar
 from ..validation import instance, numbers, rigid
+from .description import Part
 from .material import Material
-from .profile import FunctionOfX, Limits, Profile, as_profile
+from .profile import FunctionOfX, Limits, Profile, ProfilesLike, as_profile
 from .section import Section
 
 STRAINS = ("torsion", "bending_y", "bending_z", "elongation", "shear_y", "shear_z")
 """Names of the six strains $(k_x, k_y, k_z, u_x, u_y, u_z)$ in order."""
 
-_STRAIGHT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
+STRAIGHT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
+"""Strain of a straight rod without twist, stretch and shear."""
 
 
-class Rod(eqx.Module):
+_STRAIN_UNITS = ("1/m", "1/m", "1/m", "-", "-", "-")
+
+
+class Rod(Part):
     """A Cosserat rod, clamped at its base.
 
     **Arguments:**
     - `length`: $L$ [m].
-    - `section`, `material`: what makes its stiffness, see `Material.stiffness`.
+    - `section`, `material`: define the stiffness, see `Material.stiffness`.
     - `rest_strain`: $\\xi^*(X) = (k^*, u^*)$: six profiles (numbers, `Profile` or functions of X),
       or one function of X that returns six numbers. The default (0, 0, 0, 1, 0, 0) is straight. The
-      elongation $u_x^*$ has to be positive.
+      elongation $u_x^*$ must be positive.
     - `base`: pose of the section at X = 0, a rigid transform of shape (4, 4); the identity by
       default.
-    - `guide_radius`: threads are guided up to this radius [m] by discs wider than the section; by
-      default they run inside the section.
+    - `guide_radius`: radius [m] of discs that guide the threads outside the section; by default
+      the threads are inside the section.
     """
 
-    length: Scalar
+    length: Scalar = eqx.field(metadata={"unit": "m"})
     section: Section
     material: Material
-    rest_strain: tuple[Profile, ...] | FunctionOfX
-    base: Pose | None
-    guide_radius: Scalar | None
+    rest_strain: tuple[Profile, ...] | FunctionOfX = eqx.field(metadata={"unit": _STRAIN_UNITS})
+    base: Pose | None = eqx.field(metadata={"unit": "-"})
+    guide_radius: Scalar | None = eqx.field(metadata={"unit": "m"})
 
     def __init__(
         self,
-        length: Any,
+        length: ArrayLike,
         section: Section,
         material: Material,
         *,
-        rest_strain: Sequence[Any] | Callable | None = None,
-        base: Any = None,
-        guide_radius: Any = None,
+        rest_strain: ProfilesLike | None = STRAIGHT,
+        base: MatrixLike | None = None,
+        guide_radius: ArrayLike | None = None,
     ):
         self.length = numbers("Rod.length", length, positive=True)
         self.section = instance(
@@ -80,7 +84,7 @@ class Rod(eqx.Module):
         return self.material.stiffness(self.section, X, self.length)
 
     def limits(self, X: Scalar) -> Limits:
-        """Sizes, material and rest elongation at X [m] and what they have to keep to."""
+        """Sizes, material properties and rest elongation at X [m] and their limits."""
         parts = {
             "section": self.section.limits(X, self.length),
             "material": self.material.limits(X, self.length),
@@ -100,7 +104,7 @@ class Rod(eqx.Module):
         }
 
     def clearance(self, y: Scalar, z: Scalar, X: Scalar) -> Array:
-        """How far (y, z) lies inside what guides threads at X: positive inside [m]."""
+        """Distance [m] from (y, z) to the section's wall or the guide at X: positive inside."""
         inside = self.section.clearance(y, z, X, self.length)
         return (
             inside
@@ -110,8 +114,8 @@ class Rod(eqx.Module):
 
     @property
     def breakpoints(self) -> tuple[Scalar, ...]:
-        """Abscissas [m] where a size, the material, the rest strain or a derivative of them
-        jumps."""
+        """Abscissas [m] where a size, a material property, the rest strain or one of their
+        derivatives jumps."""
         rest = () if isinstance(self.rest_strain, FunctionOfX) else self.rest_strain
         return (
             *self.section.breakpoints,
@@ -120,9 +124,9 @@ class Rod(eqx.Module):
         )
 
 
-def _rest_strain(value: Any) -> tuple[Profile, ...] | FunctionOfX:
+def _rest_strain(value: ProfilesLike | None) -> tuple[Profile, ...] | FunctionOfX:
     if value is None:
-        value = _STRAIGHT
+        value = STRAIGHT
     if isinstance(value, FunctionOfX):
         return value
     if callable(value):

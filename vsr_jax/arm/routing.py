@@ -1,29 +1,29 @@
-"""Thread paths: where a thread crosses the sections, $d(X) = (0, d_y, d_z)$, in the section's
-frame.
+"""Thread paths: the position $d(X) = (0, d_y, d_z)$ of a thread in the section's frame.
 
-A routing is called as `routing(X)` with a scalar X [m] and returns (d_y, d_z) [m]; its derivatives
-are taken by forward differentiation, so a path is written down once.
+A routing is called as `routing(X)` with a scalar X [m] and returns (d_y, d_z) [m]. Its derivatives
+are computed by forward differentiation.
 """
 
 import math
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float, PyTree
 
-from ..numerics.component import Vector
-from ..typing import Scalar
+from ..numerics.component import Vector, Vector3
+from ..typing import ArrayLike, Scalar, VectorLike
 from ..validation import choice, numbers
-from .profile import FunctionOfX, PolynomialProfile, SplineProfile
+from .description import Part
+from .profile import FunctionOfX, rising_coefficients
+from .spline import spline_breakpoints, spline_points, spline_value
 
 
 class Path(NamedTuple):
-    """One thread where it crosses the sections: position (d_y, d_z) [m] and slope (d_y', d_z')
-    [-]."""
+    """Position (d_y, d_z) [m] and slope (d_y', d_z') [-] of one thread."""
 
     y: Array
     z: Array
@@ -31,7 +31,7 @@ class Path(NamedTuple):
     slope_z: Array
 
 
-def thread_tangent(xi: Vector, path: Path) -> Vector:
+def thread_tangent(xi: Vector, path: Path) -> Vector3:
     """Tangent of a thread's path in the section's frame (eq. 11): $t_c = k \\times d + u + d'$."""
     kx, ky, kz, ux, uy, uz = xi
     return (
@@ -41,7 +41,7 @@ def thread_tangent(xi: Vector, path: Path) -> Vector:
     )
 
 
-class Routing(eqx.Module):
+class Routing(Part):
     """The path of one thread through the sections."""
 
     @abstractmethod
@@ -62,10 +62,10 @@ class Routing(eqx.Module):
 class Parallel(Routing):
     """Parallel to the axis: $d = (0, y, z)$, in metres."""
 
-    y: Scalar
-    z: Scalar
+    y: Scalar = eqx.field(metadata={"unit": "m"})
+    z: Scalar = eqx.field(metadata={"unit": "m"})
 
-    def __init__(self, y: Any, z: Any):
+    def __init__(self, y: ArrayLike, z: ArrayLike):
         self.y = numbers("Parallel.y", y)
         self.z = numbers("Parallel.z", z)
 
@@ -75,14 +75,16 @@ class Parallel(Routing):
 
 class Linear(Routing):
     """Straight and oblique (eq. 22): $d = (0, y + \\bar y X, z + \\bar z X)$, slopes $\\bar y,
-    \\bar z$ without unit."""
+    \\bar z$ [-]."""
 
-    y: Scalar
-    z: Scalar
-    slope_y: Scalar
-    slope_z: Scalar
+    y: Scalar = eqx.field(metadata={"unit": "m"})
+    z: Scalar = eqx.field(metadata={"unit": "m"})
+    slope_y: Scalar = eqx.field(metadata={"unit": "-"})
+    slope_z: Scalar = eqx.field(metadata={"unit": "-"})
 
-    def __init__(self, y: Any, z: Any, slope_y: Any = 0.0, slope_z: Any = 0.0):
+    def __init__(
+        self, y: ArrayLike, z: ArrayLike, slope_y: ArrayLike = 0.0, slope_z: ArrayLike = 0.0
+    ):
         self.y = numbers("Linear.y", y)
         self.z = numbers("Linear.z", z)
         self.slope_y = numbers("Linear.slope_y", slope_y)
@@ -99,24 +101,25 @@ class Helix(Routing):
     **Arguments:**
     - `radius`: $r$ [m], positive.
     - `angle` or `pitch`: the angle $\\alpha$ between path and cross-section [rad], at most $\\pi /
-      2$, or the pitch $p$ [m]; one of the two. With `angle` the pitch follows the radius.
+      2$, or the pitch $p$ [m]; exactly one of the two. With `angle` the pitch depends on the
+      radius.
     - `phase`: $\\phi_0$ [rad].
-    - `hand`: `"right"` winds from y towards z along the arm, `"left"` the other way.
+    - `hand`: `"right"` rotates from y to z along the arm, `"left"` from z to y.
     """
 
-    radius: Scalar
-    angle: Scalar | None
-    pitch: Scalar | None
-    phase: Scalar
+    radius: Scalar = eqx.field(metadata={"unit": "m"})
+    angle: Scalar | None = eqx.field(metadata={"unit": "rad"})
+    pitch: Scalar | None = eqx.field(metadata={"unit": "m"})
+    phase: Scalar = eqx.field(metadata={"unit": "rad"})
     hand: Literal["right", "left"] = eqx.field(static=True)
 
     def __init__(
         self,
-        radius: Any,
-        angle: Any = None,
+        radius: ArrayLike,
+        angle: ArrayLike | None = None,
         *,
-        pitch: Any = None,
-        phase: Any = 0.0,
+        pitch: ArrayLike | None = None,
+        phase: ArrayLike = 0.0,
         hand: Literal["right", "left"] = "right",
     ):
         if (angle is None) == (pitch is None):
@@ -131,7 +134,7 @@ class Helix(Routing):
 
     @property
     def wavenumber(self) -> Scalar:
-        """$\\omega = 2 \\pi / p$ [rad/m], the rate at which the path turns about the axis."""
+        """$\\omega = 2 \\pi / p$ [rad/m], rate of rotation of the path about the axis."""
         if self.pitch is not None:
             return 2 * math.pi / self.pitch
         assert self.angle is not None
@@ -143,41 +146,42 @@ class Helix(Routing):
 
 
 class Polynomial(Routing):
-    """Polynomial path: $d_y = \\sum_i y_i X^i$, $d_z = \\sum_i z_i X^i$, coefficients in rising
-    order [m^(1-i)]."""
+    """Polynomial path: $d_y = \\sum_i y_i X^i$, $d_z = \\sum_i z_i X^i$, coefficients in
+    ascending order [m^(1-i)]."""
 
-    y: PolynomialProfile
-    z: PolynomialProfile
+    y: Float[Array, " terms_y"] = eqx.field(metadata={"unit": "m", "powers": True})
+    z: Float[Array, " terms_z"] = eqx.field(metadata={"unit": "m", "powers": True})
 
-    def __init__(self, y: Any, z: Any):
-        self.y = PolynomialProfile(numbers("Polynomial.y", y, None))
-        self.z = PolynomialProfile(numbers("Polynomial.z", z, None))
+    def __init__(self, y: VectorLike, z: VectorLike):
+        self.y = rising_coefficients("Polynomial.y", y)
+        self.z = rising_coefficients("Polynomial.z", z)
 
     def __call__(self, X: Scalar) -> tuple[Scalar, Scalar]:
-        return self.y(X, X), self.z(X, X)
+        return jnp.polyval(self.y[::-1], X), jnp.polyval(self.z[::-1], X)
 
 
 class Spline(Routing):
-    """Cubic not-a-knot spline through the points (X, y, z), in metres, at least two."""
+    """Cubic not-a-knot spline through at least two points (X, y, z) [m]."""
 
-    y: SplineProfile
-    z: SplineProfile
+    X: Float[Array, " points"] = eqx.field(metadata={"unit": "m"})
+    y: Float[Array, " points"] = eqx.field(metadata={"unit": "m"})
+    z: Float[Array, " points"] = eqx.field(metadata={"unit": "m"})
 
-    def __init__(self, X: Any, y: Any, z: Any):
-        knots = numbers("Spline.X", X, None)
-        self.y = SplineProfile(knots, numbers("Spline.y", y, knots.shape))
-        self.z = SplineProfile(knots, numbers("Spline.z", z, knots.shape))
+    def __init__(self, X: VectorLike, y: VectorLike, z: VectorLike):
+        self.X = spline_points("Spline.X", X)
+        self.y = numbers("Spline.y", y, self.X.shape)
+        self.z = numbers("Spline.z", z, self.X.shape)
 
     def __call__(self, X: Scalar) -> tuple[Scalar, Scalar]:
-        return self.y(X, X), self.z(X, X)
+        return spline_value(X, self.X, self.y), spline_value(X, self.X, self.z)
 
     @property
     def breakpoints(self) -> tuple[Scalar, ...]:
-        return self.y.breakpoints
+        return spline_breakpoints(self.X)
 
 
 class Function(Routing):
-    """Any path: (d_y, d_z) = `function(X, *parameters)`, written with `jax.numpy`.
+    """A path given by a function: (d_y, d_z) = `function(X, *parameters)`, with `jax.numpy`.
 
     **Arguments:**
     - `function`: takes the scalar X [m] and the parameters, returns the pair (d_y, d_z) [m].
@@ -186,7 +190,7 @@ class Function(Routing):
 
     function: FunctionOfX
 
-    def __init__(self, function: Callable, *parameters: Any):
+    def __init__(self, function: Callable[..., tuple[ArrayLike, ArrayLike]], *parameters: PyTree):
         self.function = FunctionOfX("Function", function, *parameters)
 
     def __call__(self, X: Scalar) -> tuple[Scalar, Scalar]:

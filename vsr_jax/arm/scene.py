@@ -1,4 +1,4 @@
-"""A scene: a rod with its actuators and loads, and what they present to the models at each
+"""A scene: a rod with its actuators and loads, and the quantities that models need at each
 cross-section."""
 
 from collections.abc import Sequence
@@ -10,53 +10,58 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..numerics.component import Vector, add, dot
+from ..numerics.component import Forces, Vector, Wrench, add, dot
 from ..numerics.quadrature import make_grid, piece_edges
-from ..typing import Scalar, cast
+from ..typing import DTypeLike, Scalar, VectorLike, cast
 from ..validation import ROUNDING, concrete, instance, is_traced, numbers, precise
-from .actuator import Actuator, Tendon
-from .loads import Frame, Gravity, Load
+from .actuator import Actuator
+from .description import Part, describe, described_arguments, table
+from .loads import Frame, Load
 from .profile import Limits
 from .rod import STRAINS, Rod
 from .routing import Path, thread_tangent
 
 
 class CrossSections(NamedTuple):
-    r"""What a balance knows of the cross-sections at some X: the diagonal of $\Sigma$ (6), $\xi^*$
-    (6), each thread's `Path`, and whether the thread reaches there: 1 or 0, None for one that runs
-    along the whole arm."""
+    r"""Cross-sections at given X: the diagonal of $\Sigma$ (6), $\xi^*$ (6), the `Path` of each
+    thread, and its `reach`: 1 between its ends and 0 elsewhere, None if it extends over the whole
+    arm."""
 
     stiffness: Vector
     rest: Vector
     paths: tuple[Path, ...]
     reach: tuple[Array | None, ...]
 
-    def carry(self, forces: Vector) -> Vector:
-        """Force of each thread here: that of its start where it reaches, none elsewhere."""
+    def carry(self, forces: Forces) -> Forces:
+        """Force of each thread here: equal to that at its start between its ends, else zero."""
         return shared(forces, self.reach)
 
 
-def shared(forces: Vector, shares: tuple[Array | None, ...]) -> Vector:
-    """Forces of threads, each times its share; None stands for all of it."""
+def shared(forces: Forces, shares: tuple[Array | None, ...]) -> Forces:
+    """Forces of threads, each times its share; None means one."""
     return tuple(f if share is None else f * share for f, share in zip(forces, shares, strict=True))
 
 
-class Scene(eqx.Module):
-    """A rod, the actuators laid through it and the loads on it. Only what is present is computed.
+class Scene(Part):
+    """A rod with its actuators and loads. Effects that are absent are not computed.
 
     **Arguments:**
     - `rod`: the arm.
     - `actuators`: `Thread`, `Tendon` and `Chamber` in the order of the inputs.
     - `loads`: `Gravity`, `TipWrench`, `PointWrench` and `DistributedWrench`.
-    - `free_strains`: names of the strains that can change, all six by default; the others keep
-      their rest value and the solve has the size of those that are left. `("bending_y",
-      "bending_z")` is an inextensible rod without twist and shear.
+    - `free_strains`: names of the strains that can change, all six by default. The others equal
+      their rest value and are not unknowns of the solve. `("bending_y", "bending_z")` is an
+      inextensible rod without twist and shear.
 
-    **Raises:** `ValueError` if a thread leaves the section (or the rod's `guide_radius`), a size, a
-    modulus, a density or the rest elongation is not positive somewhere, a tube has no wall or
-    Poisson's ratio is out of its range, a thread ends or a load acts beyond the arm, or gravity
-    meets a material without density; numbers are looked at only while they are known, not under
-    `jax.jit`.
+    **Raises:** `ValueError` if
+
+    - a thread is outside the section (or the rod's `guide_radius`),
+    - a size, a modulus, a density or the rest elongation is not positive somewhere,
+    - a tube has no wall, or Poisson's ratio is out of its range,
+    - a thread ends or a load acts beyond the arm,
+    - there is gravity and the material has no density.
+
+    Only known numbers are checked, not those traced by `jax.jit`.
     """
 
     rod: Rod
@@ -67,8 +72,8 @@ class Scene(eqx.Module):
     def __init__(
         self,
         rod: Rod,
-        actuators: Sequence[Actuator] = (),
-        loads: Sequence[Load] = (),
+        actuators: Sequence[Actuator] | Actuator = (),
+        loads: Sequence[Load] | Load = (),
         *,
         free_strains: Sequence[str] = STRAINS,
     ):
@@ -85,66 +90,60 @@ class Scene(eqx.Module):
                 f"Scene.free_strains: got {free_strains!r}, need some of {', '.join(STRAINS)}"
             )
         self.free_strains = tuple(name for name in STRAINS if name in names)
-        if any(isinstance(load, Gravity) for load in self.loads) and rod.material.density is None:
-            raise ValueError(
-                "Scene.loads: got a Gravity and a rod whose material has no density, need "
-                "Material(..., density=...)"
-            )
+        for load in self.loads:
+            load.check(rod)
         self._check_numbers()
+
+    def __repr__(self) -> str:
+        rod = described_arguments(self.rod) if isinstance(self.rod, Part) else []
+        rows = [(f"rod.{name}", text) for name, text in rod] or [("rod", describe(self.rod))]
+        for name in ("actuators", "loads"):
+            parts = getattr(self, name)
+            if isinstance(parts, tuple):
+                rows += [(f"{name}[{i}]", _line(part)) for i, part in enumerate(parts)]
+            else:
+                rows.append((name, describe(parts)))
+        if self.free_strains != STRAINS:
+            rows.append(("free_strains", ", ".join(self.free_strains)))
+        return table("Scene", rows)
 
     @property
     def effects(self) -> tuple[str, ...]:
-        """What the scene calls for beyond a bare rod, in words; each costs something only when it
-        is named here."""
-        names = [actuator.effect for actuator in self.actuators]
-        names += [
-            f"follower {load.effect}" if load.frame == "body" else load.effect
-            for load in self.loads
-        ]
-        if any(isinstance(load, Gravity) and load.fluid_density is not None for load in self.loads):
-            names.append("buoyancy")
-        if self.breakpoints:
-            names.append("sections")
-        tendons = [actuator for actuator in self.actuators if isinstance(actuator, Tendon)]
-        names += ["length control"] * any(tendon.control == "length" for tendon in tendons)
-        names += ["elastic tendons"] * any(tendon.stiffness is not None for tendon in tendons)
-        names += ["friction"] * any(tendon.friction is not None for tendon in tendons)
+        """Names of the effects of the scene beyond a bare rod. Other effects add no operations."""
+        threads = [actuator.effects for actuator in self.actuators]
+        loads = [load.effects for load in self.loads]
+        names = [effects[0] for effects in (*threads, *loads)]
+        names += [option for effects in loads for option in effects[1:]]
+        names += ["sections"] if self.breakpoints else []
+        names += [option for effects in threads for option in effects[1:]]
         if len(self.free_strains) < len(STRAINS):
             names.append("only " + ", ".join(self.free_strains))
         return tuple(dict.fromkeys(names))
 
     @property
     def free(self) -> tuple[int, ...]:
-        """Places of the free strains among the six."""
+        """Indices of the free strains among the six."""
         return tuple(STRAINS.index(name) for name in self.free_strains)
 
     @property
     def length_driven(self) -> tuple[int, ...]:
-        """Which actuators are driven by their length."""
-        return tuple(
-            i
-            for i, a in enumerate(self.actuators)
-            if isinstance(a, Tendon) and a.control == "length"
-        )
+        """Indices of the actuators driven by their length."""
+        return tuple(i for i, actuator in enumerate(self.actuators) if actuator.length_driven)
 
     @property
     def frictional(self) -> tuple[int, ...]:
-        """Which actuators have friction."""
-        return tuple(
-            i
-            for i, a in enumerate(self.actuators)
-            if isinstance(a, Tendon) and a.friction is not None
-        )
+        """Indices of the actuators with friction."""
+        return tuple(i for i, actuator in enumerate(self.actuators) if actuator.frictional)
 
     @property
     def coupled(self) -> bool:
-        """Whether the cross-sections depend on each other: through loads, a given thread length or
+        """Whether the cross-sections depend on each other: through loads, given thread lengths or
         friction."""
         return bool(self.loads or self.length_driven or self.frictional)
 
     @property
     def breakpoints(self) -> tuple[Scalar, ...]:
-        """Abscissas [m] where the strain or a derivative of it jumps."""
+        """Abscissas [m] where the strain or one of its derivatives jumps."""
         laid = [x for actuator in self.actuators for x in actuator.breakpoints]
         return (
             *self.rod.breakpoints,
@@ -170,25 +169,25 @@ class Scene(eqx.Module):
         nodes = jax.vmap(at)(X.reshape(-1))
         return jax.tree.map(lambda leaf: leaf.reshape(X.shape), nodes)
 
-    def forces(self, inputs: Float[Array, " inputs"]) -> Vector:
-        r"""Signed thread forces $\tau$ [N] for the inputs, one scalar a thread."""
+    def forces(self, inputs: Float[Array, " inputs"]) -> Forces:
+        r"""Signed thread forces $\tau$ [N] for the inputs, one scalar per thread."""
         return tuple(
             actuator.force(value) for actuator, value in zip(self.actuators, inputs, strict=True)
         )
 
-    def density(self, X: Array, frame: Frame) -> Vector | None:
-        """Load per length $(c, f)$ of all loads of a frame at abscissas X of any shape; None if the
-        scene has none."""
+    def density(self, X: Array, frame: Frame) -> Wrench | None:
+        """Sum $(c, f)$ of the loads per length of a frame at abscissas X of any shape; None
+        if there are none."""
         total = None
         for load in self.loads:
             if load.frame != frame or load.point(self.rod) is not None:
                 continue
             here = jax.vmap(lambda x, load=load: load.density(self.rod, x) or ())(X.reshape(-1))
-            here = tuple(jnp.broadcast_to(x, X.size).reshape(X.shape) for x in here)
+            here = jax.tree.map(lambda x: jnp.broadcast_to(x, X.size).reshape(X.shape), here)
             total = here if total is None else add(total, here)
         return total
 
-    def point_wrenches(self, frame: Frame) -> tuple[tuple[Scalar, Vector], ...]:
+    def point_wrenches(self, frame: Frame) -> tuple[tuple[Scalar, Wrench], ...]:
         """Abscissa and wrench $(M, F)$ of each load of a frame that acts at a point."""
         points = [load.point(self.rod) for load in self.loads if load.frame == frame]
         return tuple(point for point in points if point is not None)
@@ -200,10 +199,10 @@ class Scene(eqx.Module):
         ]
         return jnp.all(jnp.stack(checks)) if checks else jnp.array(True)
 
-    def check_inputs(self, inputs: Any) -> Float[Array, " inputs"]:
-        """`inputs` as an array, one number an actuator.
+    def check_inputs(self, inputs: VectorLike) -> Float[Array, " inputs"]:
+        """`inputs` as an array, one number per actuator.
 
-        **Raises:** `ValueError` for a wrong number of inputs and, while their values are known, for
+        **Raises:** `ValueError` for a wrong number of inputs and, if their values are known, for
         NaN, infinities and values outside an actuator's range.
         """
         array = numbers("inputs", inputs, None, finite=False)
@@ -231,16 +230,16 @@ class Scene(eqx.Module):
             length = concrete(self.rest_length(i))
             if length is not None and not known[i] > -length:
                 raise ValueError(
-                    f"inputs[{i}]: got {known[i]:g}, need a change of length > {-length:g} m, all "
-                    f"that the tendon has"
+                    f"inputs[{i}]: got {known[i]:g}, need a change of length > {-length:g} m, the "
+                    f"negative of the tendon's length at rest"
                 )
         return array
 
     def rest_length(self, place: int) -> Scalar:
-        """Length of a thread's path in the arm at rest [m]."""
+        """Length of a thread's path at rest [m]."""
         return _rest_length(self, place)
 
-    def astype(self, dtype: Any) -> "Scene":
+    def astype(self, dtype: DTypeLike) -> "Scene":
         """The same scene with its floating-point numbers in `dtype`, float32 or float64."""
         precise("dtype", jnp.zeros((), dtype))
         return cast(self, dtype)
@@ -265,13 +264,13 @@ class Scene(eqx.Module):
             j = int(np.argmin(values))
             if not values[j] > -ROUNDING * length:
                 raise ValueError(
-                    f"Scene.actuators[{i}].routing: the thread lies {-values[j]:.3g} m outside "
+                    f"Scene.actuators[{i}].routing: the thread is {-values[j]:.3g} m outside "
                     f"the section at X = {X[j]:g} m; "
                     "need a path inside the section (or give the rod a guide_radius)"
                 )
 
     def _check_places(self, length: float) -> None:
-        """Thread ends and point loads lie on the arm."""
+        """Raises `ValueError` if a thread end or a point load is beyond the arm."""
         beyond = length * (1 + ROUNDING)
         for i, actuator in enumerate(self.actuators):
             for name, x in (("start", actuator.start), ("end", actuator.end)):
@@ -291,6 +290,11 @@ class Scene(eqx.Module):
                 )
 
 
+def _line(part: Any) -> str:
+    text = describe(part)
+    return f"{text}, input in {part.unit}" if isinstance(part, Actuator) else text
+
+
 def _each(name: str, values: Any, kind: type, needed: str) -> tuple:
     values = (values,) if isinstance(values, kind) else values
     return tuple(instance(f"{name}[{i}]", value, kind, needed) for i, value in enumerate(values))
@@ -306,8 +310,8 @@ def _rest_length(scene: Scene, place: int) -> Scalar:
 
 @eqx.filter_jit
 def _probe(scene: Scene) -> tuple[Array, Limits, list[Array]]:
-    """Places X [m] along the arm; there, the rod's numbers that have limits, and how far each
-    thread lies inside the section [m]."""
+    """Abscissas X [m] along the arm and, at each, the numbers of the rod that have limits and the
+    clearance of each thread [m]."""
     rod = scene.rod
     X = jnp.linspace(0, 1, 65) * rod.length
 

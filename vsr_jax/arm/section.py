@@ -7,16 +7,17 @@ function of X.
 import math
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..numerics.component import norm
-from ..typing import Scalar
+from ..typing import Scalar, VectorLike
 from ..validation import choice, concrete, instance, numbers
-from .profile import Constant, Limits, Profile, as_profile, pick, rising_ends, scaled
+from .description import Part
+from .profile import Constant, Limits, Profile, ProfileLike, as_profile, pick, rising_ends, scaled
 
 Torsion = Literal["saint_venant", "polar"]
 
@@ -25,19 +26,19 @@ class Geometry(eqx.Module):
     """Area [m^2], second moments about y and z and torsion constant [m^4], and shear factors [-] of
     one cross-section."""
 
-    area: Scalar
-    moment_y: Scalar
-    moment_z: Scalar
-    torsion: Scalar
-    shear_factors: Float[Array, "2"]
+    area: Scalar = eqx.field(metadata={"unit": "m^2"})
+    moment_y: Scalar = eqx.field(metadata={"unit": "m^4"})
+    moment_z: Scalar = eqx.field(metadata={"unit": "m^4"})
+    torsion: Scalar = eqx.field(metadata={"unit": "m^4"})
+    shear_factors: Float[Array, "2"] = eqx.field(metadata={"unit": "-"})
 
 
-class Section(eqx.Module):
-    """A cross-section whose sizes may vary along the arm.
+class Section(Part):
+    """A cross-section, uniform or varying along the arm.
 
     **Arguments shared by the shapes:**
-    - `torsion`: `"saint_venant"` takes the torsion constant of the shape, `"polar"` the polar
-      moment $J_y + J_z$ (the paper's choice). Both agree for circular and annular sections.
+    - `torsion`: `"saint_venant"` is the torsion constant of the shape, `"polar"` the polar moment
+      $J_y + J_z$ (as in the paper). Both agree for circular and annular sections.
     - `shear_correction`: factors $(\\kappa_y, \\kappa_z)$ of the shear stiffness [-], one number
       for both; 1 in the paper.
     """
@@ -48,11 +49,11 @@ class Section(eqx.Module):
 
     @abstractmethod
     def clearance(self, y: Scalar, z: Scalar, X: Scalar, length: Scalar) -> Scalar:
-        """How far (y, z) lies inside the outer wall at X: positive inside, negative outside [m]."""
+        """Distance [m] from (y, z) to the outer wall at X: positive inside, negative outside."""
 
     @abstractmethod
     def outline(self, angle: Array, X: Scalar, length: Scalar) -> tuple[Array, Array]:
-        """Points (y, z) [m] of the outer wall at X, once round as `angle` [rad] goes from 0 (on the
+        """Points (y, z) [m] of the outer wall at X, a closed curve for `angle` [rad] from 0 (on the
         y axis) to 2 pi."""
 
     @property
@@ -61,21 +62,21 @@ class Section(eqx.Module):
         """The size profiles by name."""
 
     def limits(self, X: Scalar, length: Scalar) -> Limits:
-        """The sizes at X [m] and what they have to keep to."""
+        """The sizes at X [m] and their limits."""
         sizes = {name: size(X, length) for name, size in self.sizes.items()}
         return {(name, "a size > 0"): (size, size) for name, size in sizes.items()}
 
     @property
     def breakpoints(self) -> tuple[Scalar, ...]:
-        """Abscissas [m] where a size or a derivative of it jumps."""
+        """Abscissas [m] where a size or one of its derivatives jumps."""
         return tuple(x for size in self.sizes.values() for x in size.breakpoints)
 
 
-def _size(section: str, name: str, value: Any) -> Profile:
+def _size(section: str, name: str, value: ProfileLike) -> Profile:
     return as_profile(f"{section}.{name}", value, positive=True)
 
 
-def _options(torsion: Torsion, shear_correction: Any) -> tuple[Torsion, Float[Array, "2"]]:
+def _options(torsion: Torsion, shear_correction: VectorLike) -> tuple[Torsion, Float[Array, "2"]]:
     factor = numbers("shear_correction", shear_correction, None, positive=True)
     if factor.shape not in ((), (2,)):
         raise ValueError(f"shear_correction: got shape {factor.shape}, need one number or two")
@@ -85,23 +86,28 @@ def _options(torsion: Torsion, shear_correction: Any) -> tuple[Torsion, Float[Ar
 class Circular(Section):
     """Solid disc: $A = \\pi r^2$, $J_y = J_z = \\pi r^4 / 4$, $J_x = \\pi r^4 / 2$.
 
-    **Arguments:** `radius` or `diameter` [m], one of the two; the radius is what is kept.
+    **Arguments:** `radius` or `diameter` [m], exactly one of the two; the radius is stored.
     """
 
-    radius: Profile
+    radius: Profile = eqx.field(metadata={"unit": "m"})
     torsion: Torsion = eqx.field(static=True)
-    shear_correction: Float[Array, "2"]
+    shear_correction: Float[Array, "2"] = eqx.field(metadata={"unit": "-"})
 
-    def __init__(self, radius: Any = None, *, diameter: Any = None, shear_correction: Any = 1.0):
+    def __init__(
+        self,
+        radius: ProfileLike | None = None,
+        *,
+        diameter: ProfileLike | None = None,
+        shear_correction: VectorLike = 1.0,
+    ):
         if (radius is None) == (diameter is None):
             raise ValueError(
                 f"Circular: got radius={radius!r} and diameter={diameter!r}, need one of the two"
             )
-        self.radius = (
-            scaled(0.5, _size("Circular", "diameter", diameter))
-            if radius is None
-            else _size("Circular", "radius", radius)
-        )
+        if radius is not None:
+            self.radius = _size("Circular", "radius", radius)
+        elif diameter is not None:
+            self.radius = scaled(0.5, _size("Circular", "diameter", diameter))
         self.torsion, self.shear_correction = _options("saint_venant", shear_correction)
 
     def geometry(self, X: Scalar, length: Scalar) -> Geometry:
@@ -125,12 +131,14 @@ class Annular(Section):
     """Tube of radii $r < R$: $A = \\pi (R^2 - r^2)$, $J_y = J_z = \\pi (R^4 - r^4) / 4$, $J_x = 2
     J_y$."""
 
-    outer: Profile
-    inner: Profile
+    outer: Profile = eqx.field(metadata={"unit": "m"})
+    inner: Profile = eqx.field(metadata={"unit": "m"})
     torsion: Torsion = eqx.field(static=True)
-    shear_correction: Float[Array, "2"]
+    shear_correction: Float[Array, "2"] = eqx.field(metadata={"unit": "-"})
 
-    def __init__(self, outer: Any, inner: Any, *, shear_correction: Any = 1.0):
+    def __init__(
+        self, outer: ProfileLike, inner: ProfileLike, *, shear_correction: VectorLike = 1.0
+    ):
         self.outer = _size("Annular", "outer", outer)
         self.inner = _size("Annular", "inner", inner)
         if isinstance(self.outer, Constant) and isinstance(self.inner, Constant):
@@ -174,22 +182,22 @@ class Rectangular(Section):
 
     The Saint-Venant constant with $a \ge b$ the sides is $\frac{a b^3}{3} \left(1 -
     \frac{192}{\pi^5} \frac b a \sum_{n\,odd} \frac{1}{n^5} \tanh\frac{n \pi a}{2 b}\right)$; the
-    part of the sum with tanh = 1 is exact, so nine terms reach rounding. **Source:** Timoshenko &
-    Goodier, Theory of Elasticity, art. 109.
+    part of the sum with tanh = 1 is exact, so nine terms are accurate to rounding. **Source:**
+    Timoshenko & Goodier, Theory of Elasticity, art. 109.
     """
 
-    width: Profile
-    height: Profile
+    width: Profile = eqx.field(metadata={"unit": "m"})
+    height: Profile = eqx.field(metadata={"unit": "m"})
     torsion: Torsion = eqx.field(static=True)
-    shear_correction: Float[Array, "2"]
+    shear_correction: Float[Array, "2"] = eqx.field(metadata={"unit": "-"})
 
     def __init__(
         self,
-        width: Any,
-        height: Any,
+        width: ProfileLike,
+        height: ProfileLike,
         *,
         torsion: Torsion = "saint_venant",
-        shear_correction: Any = 1.0,
+        shear_correction: VectorLike = 1.0,
     ):
         self.width = _size("Rectangular", "width", width)
         self.height = _size("Rectangular", "height", height)
@@ -236,18 +244,18 @@ class Elliptic(Section):
     a^3 b^3}{a^2 + b^2}$.
     """
 
-    semi_axis_y: Profile
-    semi_axis_z: Profile
+    semi_axis_y: Profile = eqx.field(metadata={"unit": "m"})
+    semi_axis_z: Profile = eqx.field(metadata={"unit": "m"})
     torsion: Torsion = eqx.field(static=True)
-    shear_correction: Float[Array, "2"]
+    shear_correction: Float[Array, "2"] = eqx.field(metadata={"unit": "-"})
 
     def __init__(
         self,
-        semi_axis_y: Any,
-        semi_axis_z: Any,
+        semi_axis_y: ProfileLike,
+        semi_axis_z: ProfileLike,
         *,
         torsion: Torsion = "saint_venant",
-        shear_correction: Any = 1.0,
+        shear_correction: VectorLike = 1.0,
     ):
         self.semi_axis_y = _size("Elliptic", "semi_axis_y", semi_axis_y)
         self.semi_axis_z = _size("Elliptic", "semi_axis_z", semi_axis_z)
@@ -278,17 +286,17 @@ class Elliptic(Section):
 
 
 class Joined(Section):
-    """One section after another along the arm, with jumps between them.
+    """Consecutive sections along the arm, with jumps between them.
 
     **Arguments:**
-    - `ends`: where each section but the last ends [m], rising.
-    - `sections`: one more than `ends`, of any shapes.
+    - `ends`: abscissas [m] where the sections end, except the last; increasing.
+    - `sections`: one more than `ends`, of any shape.
     """
 
-    ends: Float[Array, " inner"]
+    ends: Float[Array, " inner"] = eqx.field(metadata={"unit": "m"})
     sections: tuple[Section, ...]
 
-    def __init__(self, ends: Any, sections: Sequence[Section]):
+    def __init__(self, ends: VectorLike, sections: Sequence[Section]):
         self.ends = rising_ends("Joined", ends, sections)
         self.sections = tuple(
             instance(f"Joined.sections[{i}]", s, Section, "a section")

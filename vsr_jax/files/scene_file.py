@@ -1,12 +1,12 @@
 """Scenes as TOML files: every object is a table with `type = "Helix"` and the arguments of its
 constructor by name.
 
-The top of a file holds the arguments of `Scene` and, if wanted, a `title` and the `inputs`.
-Arguments keep the units of the constructors. Where only one class can stand (`rod`, `material`) the
-type may be left out, and where a profile is expected a plain number will do.
+The top level of a file contains the arguments of `Scene` and, optionally, a `title` and `inputs`.
+Units are those of the constructors. The type is optional where only one class is possible (`rod`,
+`material`). A profile can be a plain number.
 
-To teach the files a new class, add it to its group below; the arguments are read off its
-constructor and, for writing, off the attributes of the same names.
+A new class needs an entry in its group below and a field for each argument of its constructor, of
+the same name. An argument without a field is read but not written, as `diameter` of `Circular`.
 """
 
 import difflib
@@ -14,8 +14,7 @@ import inspect
 import re
 import tomllib
 import uuid
-from operator import attrgetter
-from os import PathLike
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,6 +23,7 @@ import tomli_w
 from jaxtyping import Array, Float
 
 from ..arm.actuator import Chamber, Tendon, Thread
+from ..arm.fields import arguments
 from ..arm.loads import DistributedWrench, Gravity, PointWrench, TipWrench
 from ..arm.material import Material
 from ..arm.profile import Constant, Piecewise, PolynomialProfile, SplineProfile, Taper
@@ -31,9 +31,13 @@ from ..arm.rod import Rod
 from ..arm.routing import Helix, Linear, Parallel, Polynomial, Spline
 from ..arm.scene import Scene
 from ..arm.section import Annular, Circular, Elliptic, Joined, Rectangular
+from ..typing import PathLike, VectorLike
 from ..validation import concrete
 
 Group = dict[str, type]
+
+Table = dict[str, Any]
+"""A table of a TOML file."""
 
 
 def _group(*kinds: type) -> Group:
@@ -51,31 +55,16 @@ _GROUPS = {
     "actuators": _group(Thread, Tendon, Chamber),
     "loads": _group(Gravity, TipWrench, PointWrench, DistributedWrench),
 }
-"""Which classes can stand under a key; profiles under every other."""
-
-_STORED_AS = {
-    (Polynomial, "y"): "y.coefficients",
-    (Polynomial, "z"): "z.coefficients",
-    (Spline, "X"): "y.X",
-    (Spline, "y"): "y.values",
-    (Spline, "z"): "z.values",
-}
-"""Arguments kept in another attribute than the one of their name."""
-
-_NOT_STORED = ((Circular, "diameter"),)
-"""Arguments that say in another way what is stored under another name."""
-
-_DEFAULTS = {(Rod, "rest_strain"): (0.0, 0.0, 0.0, 1.0, 0.0, 0.0)}
-"""What a default of None stands for."""
+"""Classes that are possible under a key; profiles under every other key."""
 
 _FILE_KEYS = ("title", "inputs")
 _SHORT_LIST = re.compile(r"\[\n[^][{}]*\]")
 
 
 class SceneFile(NamedTuple):
-    """What a scene file holds.
+    """Contents of a scene file.
 
-    **Fields:** the `scene`; `inputs`, one number an actuator, None if the file gives none; the
+    **Fields:** the `scene`; `inputs`, one number per actuator, None if the file has none; the
     `title`, free text.
     """
 
@@ -84,18 +73,18 @@ class SceneFile(NamedTuple):
     title: str = ""
 
 
-def load(path: str | PathLike[str]) -> SceneFile:
+def load(path: PathLike) -> SceneFile:
     """Reads a scene from a TOML file.
 
-    Numbers take JAX's precision: for float64 set `jax_enable_x64` first.
+    Numbers have JAX's default precision: for float64 set `jax_enable_x64` first.
 
-    **Arguments:** `path`: of the file.
+    **Arguments:** `path`: the file.
 
     **Returns:** a `SceneFile`: the scene, its inputs and its title.
 
-    **Raises:** `ValueError` of one line that begins with the file's name, if it cannot be read, is
-    no TOML (with line and column) or holds anything that is unknown, missing or refused by a
-    constructor (with the key's path).
+    **Raises:** `ValueError`, one line that starts with the file's name, if the file cannot be read,
+    is not TOML (with line and column) or has a key or value that is unknown, missing or rejected by
+    a constructor (with the key's path).
     """
     try:
         return parse_scene(Path(path).read_text(encoding="utf-8"))
@@ -113,8 +102,8 @@ def parse_scene(text: str) -> SceneFile:
     return parse_table(tomllib.loads(text), "")
 
 
-def parse_table(table: dict[str, Any], path: str) -> SceneFile:
-    """The scene in a table of a TOML file, which lies there under `path`.
+def parse_table(table: Table, path: str) -> SceneFile:
+    """The scene in a table of a TOML file; `path` is the path of the table's key.
 
     **Raises:** `ValueError` as `load`, without the file's name.
     """
@@ -128,32 +117,31 @@ def parse_table(table: dict[str, Any], path: str) -> SceneFile:
     return SceneFile(scene, None if inputs is None else scene.check_inputs(inputs), title)
 
 
-def to_toml(scene: Scene, inputs: Any = None, title: str = "") -> str:
-    """A scene as TOML text, which `parse_scene` reads back to the last bit in the same precision.
+def to_toml(scene: Scene, inputs: VectorLike | None = None, title: str = "") -> str:
+    """A scene as TOML text, which `parse_scene` reads back bit-identically in the same
+    precision.
 
-    Arguments that have their default value are left out.
+    Arguments with their default value are omitted.
 
     **Arguments:**
     - `scene`: the scene.
-    - `inputs`: one number an actuator, to be kept with it.
+    - `inputs`: one number per actuator, stored with the scene.
     - `title`: free text.
 
-    **Raises:** `ValueError` for a scene with Python functions in it or with classes of your own,
-    naming the place; for one that is traced by `jax.jit` or its kin; and for inputs that the scene
-    refuses.
+    **Raises:** `ValueError` for a scene with Python functions or user-defined classes, with their
+    path; for a scene traced by a JAX transformation such as `jax.jit`; and for invalid inputs.
     """
-    head: dict[str, Any] = {"title": title} if title else {}
+    head: Table = {"title": title} if title else {}
     if inputs is not None:
         head["inputs"] = _numbers(scene.check_inputs(inputs), "inputs")
     text = tomli_w.dumps(head | _arguments(scene, ""))
     return _SHORT_LIST.sub(_on_one_line, text)
 
 
-def save(scene: Scene, path: str | PathLike[str], inputs: Any = None, title: str = "") -> None:
-    """Writes a scene to a TOML file, which `load` reads; see `to_toml` for the arguments and what
-    is refused.
+def save(scene: Scene, path: PathLike, inputs: VectorLike | None = None, title: str = "") -> None:
+    """Writes a scene to a TOML file, which `load` reads. Arguments and errors as for `to_toml`.
 
-    The file is replaced as a whole, or not at all.
+    The write is atomic: an interrupted call leaves the previous file.
     """
     text, file = to_toml(scene, inputs, title), Path(path)
     part = file.with_name(f".{file.name}.{uuid.uuid4().hex}")
@@ -165,8 +153,8 @@ def save(scene: Scene, path: str | PathLike[str], inputs: Any = None, title: str
 
 
 def _on_one_line(match: re.Match[str]) -> str:
-    # The writer breaks every list; text in quotes has no line breaks, those that there are lie
-    # between the items.
+    # The writer puts each item on a line of its own. Quoted text has no line breaks, so every line
+    # break is between items.
     return "[" + re.sub(r",?\n\s*", ", ", match[0][1:-1]).strip(", ") + "]"
 
 
@@ -183,8 +171,8 @@ def _read(value: Any, path: str, group: Group) -> Any:
     return value
 
 
-def kind_of(table: dict[str, Any], path: str, group: Group) -> type:
-    """The class that a table names in its `type`, one of a group."""
+def kind_of(table: Table, path: str, group: Group) -> type:
+    """The class named by the `type` of a table, one of a group."""
     known = ", ".join(sorted(group))
     if "type" not in table:
         if len(group) == 1:
@@ -196,20 +184,20 @@ def kind_of(table: dict[str, Any], path: str, group: Group) -> type:
     return group[name]
 
 
-def _build(kind: type, table: dict[str, Any], path: str) -> Any:
+def _build(kind: type, table: Table, path: str) -> Any:
     check_keys(kind, table, path)
-    arguments = {
+    given = {
         key: _read(value, _below(path, key), _GROUPS.get(key, _PROFILES))
         for key, value in table.items()
     }
     try:
-        return kind(**arguments)
+        return kind(**given)
     except (ValueError, TypeError, OverflowError) as error:
         raise ValueError(at(path, " ".join(str(error).split()))) from None
 
 
-def check_keys(kind: type, table: dict[str, Any], path: str, more: tuple[str, ...] = ()) -> None:
-    """Refuses keys that are no arguments of a class, and missing ones that are."""
+def check_keys(kind: type, table: Table, path: str, more: tuple[str, ...] = ()) -> None:
+    """Raises `ValueError` for keys that are not arguments of a class and for missing ones."""
     parameters = inspect.signature(kind).parameters
     known = sorted((*parameters, *more))
     for key in table:
@@ -222,7 +210,7 @@ def check_keys(kind: type, table: dict[str, Any], path: str, more: tuple[str, ..
             raise ValueError(at(path, f"missing key {name!r}, known are {', '.join(known)}"))
 
 
-def _guess(name: Any, known: Any) -> str:
+def _guess(name: object, known: Iterable[str]) -> str:
     names = {candidate.lower(): candidate for candidate in known}
     close = difflib.get_close_matches(str(name).lower(), names, n=1)
     return f"; did you mean {names[close[0]]!r}?" if close else ""
@@ -233,20 +221,16 @@ def _below(path: str, key: str) -> str:
 
 
 def at(path: str, message: str) -> str:
-    """A message that begins with where it belongs."""
+    """A message with the path of its key in front."""
     return f"{path}: {message}" if path else message
 
 
-def _arguments(value: Any, path: str) -> dict[str, Any]:
-    kind, table = type(value), {}
-    for name, parameter in inspect.signature(kind).parameters.items():
-        if (kind, name) in _NOT_STORED:
-            continue
-        stored = attrgetter(_STORED_AS.get((kind, name), name))(value)
-        if stored is None:
-            continue
-        plain = _write(stored, _below(path, name), _GROUPS.get(name, _PROFILES))
-        if not _same(plain, _DEFAULTS.get((kind, name), parameter.default)):
+def _arguments(value: Any, path: str) -> Table:
+    table = {}
+    for argument in arguments(value):
+        name = argument.name
+        plain = _write(argument.value, _below(path, name), _GROUPS.get(name, _PROFILES))
+        if not _same(plain, argument.default):
             table[name] = plain
     return table
 
@@ -263,7 +247,7 @@ def _write(value: Any, path: str, group: Group) -> Any:
     name = type(value).__name__
     if group.get(name) is not type(value):
         raise ValueError(
-            f"{path}: a {name} cannot be kept in a scene file; need one of "
+            f"{path}: a {name} cannot be stored in a scene file; need one of "
             f"{', '.join(sorted(group))}"
         )
     table = _arguments(value, path)
@@ -271,11 +255,10 @@ def _write(value: Any, path: str, group: Group) -> Any:
 
 
 def _numbers(value: Any, path: str) -> Any:
-    """Numbers as floats: the shortest decimals that give the same numbers in their own
-    precision."""
+    """Numbers as floats with the shortest decimals that are exact in the numbers' precision."""
     known = concrete(value)
     if known is None:
-        raise ValueError(f"{path}: a traced value cannot be kept in a scene file")
+        raise ValueError(f"{path}: a traced value cannot be stored in a scene file")
     return np.array([float(str(x)) for x in known.ravel()]).reshape(known.shape).tolist()
 
 
