@@ -19,6 +19,8 @@ MODEL = vsr.StrainDependent(6)
 PROBLEM = """
 title = "A thread to one place"
 inputs = [[2.0]]
+
+[search]
 steps = 4
 starts = 2
 candidates = 2
@@ -112,7 +114,7 @@ def test_a_film_has_a_frame_for_each_arm(eq, tmp_path):
 
 
 def test_a_problem_file_is_designed_kept_and_drawn(problem, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(cli_design, "hasten", lambda optimise: None)
+    monkeypatch.setattr(cli_design, "reduce_compile_time", lambda optimise: None)
     out, record, picture = (
         tmp_path / name for name in ("designed.toml", "design.json", "design.png")
     )
@@ -121,7 +123,7 @@ def test_a_problem_file_is_designed_kept_and_drawn(problem, tmp_path, capsys, mo
     )
     said = capsys.readouterr().out
     assert code == 0
-    assert "Inside(wall=0.001): kept" in said
+    assert "Inside(wall=0.001): satisfied" in said
     assert "actuators[0].routing.y = " in said
     kept, told = load(out), json.loads(record.read_text())
     assert float(kept.scene.actuators[0].routing.y) == pytest.approx(
@@ -134,10 +136,9 @@ def test_a_problem_file_is_designed_kept_and_drawn(problem, tmp_path, capsys, mo
 
 
 def test_a_history_marks_the_one_that_was_chosen(problem):
-    task = load_design(problem)
-    found = vsr.design(
-        task.scene, task.free, task.objective, task.inputs, progress=False, **task.settings
-    )
+    arguments = load_design(problem)._asdict()
+    del arguments["title"]
+    found = vsr.design(**arguments, progress=False)
     lines = plot_design.history(found).get_lines()
     assert [line.get_label() for line in lines][-1] == "chosen"
     assert np.nanmin(lines[-1].get_ydata()) == pytest.approx(found.objective)
@@ -156,6 +157,9 @@ def test_a_history_marks_the_one_that_was_chosen(problem):
         ("wall = 0.001", "wall = -1.0", r"constraints\[0\]: Inside.wall: got -1"),
         ("young = 8e5", "young = -8e5", "young"),
         ("inputs = [[2.0]]", "", "missing key 'inputs'"),
+        ("steps = 4", "step = 4", r"search: unknown key 'step'.*did you mean 'steps'"),
+        ("steps = 4", "steps = 0", r"search: Search.steps: got 0, need an integer >= 1"),
+        ("steps = 4", "optimizer = 1", r"search: got .*, need a table of numbers"),
     ],
 )
 def test_errors_of_problem_files_name_file_and_place(unchecked, problem, old, new, message):

@@ -22,7 +22,7 @@ def history(design: Design, ax: Any = None) -> Any:
     **Returns:** the axes; logarithmic where all values are positive.
     """
     ax = plt.subplots(figsize=(5, 3.2), layout="constrained")[1] if ax is None else ax
-    kept = np.where(design.trace.violation <= 0, design.trace.objective, np.inf)
+    kept = np.where(design.history.violation <= 0, design.history.objective, np.inf)
     so_far = np.minimum.accumulate(np.where(np.isnan(kept), np.inf, kept), axis=0)
     so_far[np.isinf(so_far)] = np.nan
     best = min(
