@@ -66,7 +66,7 @@ def test_command_refuses_an_empty_batch(capsys):
     with pytest.raises(SystemExit) as refusal:
         cli.main(["effects", "--batch-size", "0"])
     assert refusal.value.code == cli.BAD_USAGE
-    assert "--batch-size: got 0, need a whole number >= 1" in capsys.readouterr().err
+    assert "--batch-size: got 0, need an integer >= 1" in capsys.readouterr().err
 
 
 @pytest.mark.slow

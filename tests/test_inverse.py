@@ -56,6 +56,19 @@ def test_what_is_out_of_reach_gets_the_nearest_point_and_says_so(reached):
     assert np.all(found.equilibrium.converged)
 
 
+def test_a_result_prints_what_the_command_prints(reached, scene):
+    found = reached[-1]
+    one = jax.tree.map(lambda x: x[0], found)
+    lines = str(one).splitlines()
+    assert repr(one) == str(one)
+    assert lines[0].startswith("inputs     ")
+    assert lines[1].endswith("m, within the 7.5e-05 m allowed")
+    assert str(found).startswith("8 of 9 targets reached, largest miss 1.2 m")
+    texts = []
+    jax.eval_shape(lambda x: texts.append(str(x)) or x.miss, one)
+    assert texts[0].startswith("Reach(inputs=")
+
+
 def test_what_is_missed_by_less_than_is_allowed_is_reached(reached):
     _, _, found = reached
     np.testing.assert_allclose(found.miss[7], 2e-5, rtol=1e-6)
@@ -237,7 +250,7 @@ def test_the_command(tmp_path, capsys, monkeypatch, scene, close):
     verdict = (
         "0.0002 m, within the"
         if close
-        else "0.3 m, out of reach, this is the nearest found: more than the"
+        else "0.3 m, out of reach, this is the nearest point found: more than the"
     )
     assert f"  miss       {verdict} 0.001 m allowed\n" in text
     saved = json.loads(out.read_text())

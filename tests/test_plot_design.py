@@ -135,12 +135,12 @@ def test_a_problem_file_is_designed_kept_and_drawn(problem, tmp_path, capsys, mo
     assert picture.stat().st_size > 10_000
 
 
-def test_a_history_marks_the_one_that_was_chosen(problem):
+def test_a_history_marks_the_best_start(problem):
     arguments = load_design(problem)._asdict()
     del arguments["title"]
     found = vsr.design(**arguments, progress=False)
     lines = plot_design.history(found).get_lines()
-    assert [line.get_label() for line in lines][-1] == "chosen"
+    assert [line.get_label() for line in lines][-1] == "best start"
     assert np.nanmin(lines[-1].get_ydata()) == pytest.approx(found.objective)
 
 

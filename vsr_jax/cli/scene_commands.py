@@ -28,9 +28,9 @@ from .common import (
     add_precision,
     check_folders,
     command,
-    hasten,
-    positive,
-    use,
+    positive_integer,
+    reduce_compile_time,
+    set_precision,
     warn,
 )
 
@@ -118,7 +118,10 @@ def add_scene(parser: argparse.ArgumentParser) -> None:
         f"order {LEGENDRE_ORDER} for each free strain",
     )
     parser.add_argument(
-        "--steps", metavar="N", type=positive, help="steps along the arm (default: the model's)"
+        "--steps",
+        metavar="N",
+        type=positive_integer,
+        help="steps along the arm (default: the model's)",
     )
     parser.add_argument(
         "--tolerance",
@@ -143,7 +146,7 @@ def task_of(options: argparse.Namespace) -> Task:
 
     **Raises:** `ValueError` for a file or numbers that make no sense.
     """
-    use(options.precision)
+    set_precision(options.precision)
     scene, inputs, title = load(options.scene)
     warn(warnings_of(scene))
     inputs = inputs if options.inputs is None else options.inputs
@@ -172,7 +175,7 @@ def model_between(
 
 
 def _solve(options: argparse.Namespace) -> int:
-    hasten(optimise=False)
+    reduce_compile_time(optimise=False)
     scene, inputs, model, title = task_of(options)
     check_folders(options.plot, options.json)
     eq = solve(scene, inputs, model=model, tolerance=options.tolerance)
@@ -184,7 +187,7 @@ def _solve(options: argparse.Namespace) -> int:
 def _check(options: argparse.Namespace) -> int:
     from . import report
 
-    hasten(optimise=True)
+    reduce_compile_time(optimise=True)
     scene, inputs, model, title = task_of(options)
     check_folders(options.json)
     model = (
