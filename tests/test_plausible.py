@@ -8,9 +8,10 @@ import pytest
 
 import vsr_jax as vsr
 from vsr_jax.analysis import plausible
+from vsr_jax.analysis.health import Limit
 from vsr_jax.cli import common as cli_common, main as cli, report
 from vsr_jax.files.scene_file import load
-from vsr_jax.optimization import design_search as optimize
+from vsr_jax.optimization import design_search
 from vsr_jax.studies import paper
 
 FOLDER = pathlib.Path(__file__).parents[1] / "notebooks"
@@ -126,7 +127,7 @@ def test_large_strains_are_named_and_failed_or_traced_solves_are_not(helix):
 
 def test_the_health_of_a_solve_has_the_warnings(helix):
     eq = vsr.solve(arm(length=400.0), [0.0], model=vsr.StrainDependent(4))
-    limit = vsr.health.Limit(jnp.array(2.0), jnp.array(0))
+    limit = Limit(jnp.array(2.0), jnp.array(0))
     health = vsr.Health(eq, None, limit, None, jnp.array(0.0))
     (sentence,) = health.warnings
     assert f"  warning      {sentence}" in report.health_lines(health)
@@ -156,7 +157,7 @@ def test_design_warns_on_stderr_before_it_begins(tmp_path, capsys, monkeypatch):
     def design(*_, **__):
         raise ValueError("not now")
 
-    monkeypatch.setattr(optimize, "design", design)
+    monkeypatch.setattr(design_search, "design", design)
     path = tmp_path / "problem.toml"
     text = (FOLDER / "problems" / "reach_out.toml").read_text()
     path.write_text(text.replace("young = 8e5", "young = 0.8"))

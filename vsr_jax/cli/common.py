@@ -21,12 +21,23 @@ Commands = argparse._SubParsersAction
 
 
 def command(
-    commands: Commands, name: str, *, example: str, run: Callable, more: str = "", **texts: str
+    commands: Commands,
+    name: str,
+    *,
+    example: str,
+    run: Callable,
+    help: str,
+    description: str,
+    more: str = "",
 ) -> argparse.ArgumentParser:
     """Adds a command whose help ends with an example, the text `more` and the exit codes."""
     epilog = f"example:\n  {example}\n{more}\n{EXIT_CODES}"
     parser = commands.add_parser(
-        name, epilog=epilog, formatter_class=argparse.RawDescriptionHelpFormatter, **texts
+        name,
+        help=help,
+        description=description,
+        epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.set_defaults(run=run)
     return parser

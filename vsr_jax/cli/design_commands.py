@@ -120,8 +120,8 @@ def _draw(scene: Scene, found: Any, inputs: np.ndarray, path: str) -> None:
     from ..viz import plot_design
 
     figure = plt.figure(figsize=(10, 4.5))
-    plot_design.before_after(
-        scene, found, inputs, figure.add_axes((0.0, 0.05, 0.52, 0.9), projection="3d")
-    )
+    space = figure.add_subplot(projection="3d")
+    space.set_position((0.0, 0.05, 0.52, 0.9))
+    plot_design.before_after(scene, found, inputs, space)
     plot_design.history(found, figure.add_axes((0.66, 0.14, 0.32, 0.8)))
     figure.savefig(path, dpi=150)

@@ -132,8 +132,8 @@ def add_scene(parser: argparse.ArgumentParser) -> None:
     add_precision(parser)
 
 
-class Task(NamedTuple):
-    """What the command line and the file ask for."""
+class SceneTask(NamedTuple):
+    """Scene, inputs, model and title from the file and the command line."""
 
     scene: Scene
     inputs: Array
@@ -141,7 +141,7 @@ class Task(NamedTuple):
     title: str
 
 
-def task_of(options: argparse.Namespace) -> Task:
+def task_of(options: argparse.Namespace) -> SceneTask:
     """What is to be solved, in the precision asked for; warns of implausible numbers.
 
     **Raises:** `ValueError` for a file or numbers that make no sense.
@@ -161,11 +161,11 @@ def task_of(options: argparse.Namespace) -> Task:
             "--tolerance: got --model or --steps too, need one or the other: a tolerance chooses "
             "both"
         )
-    return Task(scene, values, _model(options.model, options.steps, scene), title)
+    return SceneTask(scene, values, _model(options.model, options.steps, scene), title)
 
 
 def model_between(
-    task: Task, tolerance: float | None, low: np.ndarray, high: np.ndarray
+    task: SceneTask, tolerance: float | None, low: np.ndarray, high: np.ndarray
 ) -> Model | None:
     """The model asked for, or for inputs between two bounds the one that a tolerance takes."""
     if tolerance is None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..models.strain_dependent import StrainDependent
 from .common import DONE, NOT_CONVERGED, Commands, check_folders, command, positive_integer
-from .scene_commands import Task, save, task_of
+from .scene_commands import SceneTask, save, task_of
 
 _GROUPS = ("steps", "bases", "continuum")
 """Copy of `studies.accuracy.GROUPS`; importing it takes a second."""
@@ -143,7 +143,7 @@ def _effects(options: argparse.Namespace) -> int:
     costs = effects.measure(
         options.batch_size,
         model=StrainDependent(options.steps),
-        report=lambda name: print(f"compiling: {name}", file=sys.stderr),
+        report=lambda message: print(message, file=sys.stderr),
     )
     print("\n".join(effects.table(costs)))
     if options.json:
@@ -151,12 +151,12 @@ def _effects(options: argparse.Namespace) -> int:
     return DONE if all(cost.converged == 1 for cost in costs) else NOT_CONVERGED
 
 
-def _two_helices(inputs: list[float] | None) -> Task:
+def _two_helices(inputs: list[float] | None) -> SceneTask:
     from ..studies import paper
 
     values = np.asarray([-15.0, -15.0] if inputs is None else inputs)
     scene = paper.scene("B2")
-    return Task(scene, scene.check_inputs(values), None, "B2, two helices")
+    return SceneTask(scene, scene.check_inputs(values), None, "B2, two helices")
 
 
 def _accuracy(options: argparse.Namespace) -> int:
@@ -174,7 +174,7 @@ def _accuracy(options: argparse.Namespace) -> int:
         task.scene,
         jnp.asarray(shares) * task.inputs,
         settings,
-        report=lambda name: print(f"compiling: {name}", file=sys.stderr),
+        report=lambda message: print(message, file=sys.stderr),
     )
     print("\n".join([*accuracy.table(rows), "", *accuracy.advice(rows)]))
     title = task.title or options.scene

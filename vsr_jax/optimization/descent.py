@@ -104,7 +104,7 @@ def adam(learning_rate: float, steps: int) -> optax.GradientTransformationExtraA
     )
 
 
-def first_update(optimizer: optax.GradientTransformationExtraArgs, z: Numbers) -> Numbers:
+def first_update(optimizer: optax.GradientTransformationExtraArgs, z: Numbers) -> PyTree:
     """First update of an optimizer for $f = |z|^2 / 2$: a program that identifies the optimizer."""
 
     def half(z: Numbers) -> Array:
@@ -132,7 +132,7 @@ def begin(
     first = jax.tree.map(bounded.coordinate, problem.low, problem.high, given)
     margins = eqx.filter_eval_shape(problem.loss, problem.low, jnp.ones(()))[1][1]
     bad = jnp.full((starts, *margins.shape), -jnp.inf, margins.dtype)
-    nothing = Best({}, jnp.full(starts, jnp.inf, margins.dtype), bad)
+    worst = Best({}, jnp.full(starts, jnp.inf, margins.dtype), bad)
     best = None
     for _ in range(candidates):
         drawn = {
@@ -140,11 +140,11 @@ def begin(
             for name, low in problem.low.items()
         }
         z = jax.tree.map(lambda share, own: bounded.at_share(share).at[0].set(own), drawn, first)
-        so_far = nothing._replace(z=z) if best is None else best
+        so_far = worst._replace(z=z) if best is None else best
         state = DescentState(z, z, jax.vmap(optimizer.init)(z), so_far)
         best = descend(problem, optimizer, state, penalty_weight(0, 1))[0].best
-    z = nothing.z if best is None else best.z
-    return DescentState(z, z, jax.vmap(optimizer.init)(z), nothing._replace(z=z))
+    z = worst.z if best is None else best.z
+    return DescentState(z, z, jax.vmap(optimizer.init)(z), worst._replace(z=z))
 
 
 @eqx.filter_jit

@@ -169,12 +169,11 @@ def design(
     problem, terms, given = formulate(
         scene, free, objective, inputs, constraints, uncertain or {}, model
     )
-    search = Search() if search is None else instance("search", search, Search, "a Search")
-    settings = (search.starts, search.candidates, search.seed, search.steps)
-    checkpoint = Checkpoint(out, problem, search.update_rule, settings)
-    states = begin(
-        problem, search.update_rule, given, search.starts, search.candidates, search.seed
-    )
+    search = Search() if search is None else search
+    instance("search", search, Search, "a Search")
+    rule, settings = search.update_rule, (search.starts, search.candidates, search.seed)
+    checkpoint = Checkpoint(out, problem, rule, (*settings, search.steps))
+    states = begin(problem, rule, given, *settings)
     states, history = _run(problem, search, checkpoint, states, progress)
     return _result(problem, terms, states, history)
 
