@@ -73,8 +73,8 @@ OBJECTIVES = {
 }
 
 
-def test_a_thread_that_starts_on_the_axis_moves():
-    """There the distance to the axis has no derivative, and Inside had the slope NaN."""
+def test_a_thread_leaves_the_axis():
+    """On the axis the distance to it has no derivative; the gradient of Inside was NaN."""
     start = vsr.Scene(arm().rod, [vsr.Tendon(vsr.Parallel(0.0, 0.0))])
     aim = vsr.solve(
         vsr.Scene(arm().rod, [vsr.Tendon(vsr.Parallel(0.003, 0.002))]), [2.0], model=MODEL
@@ -100,9 +100,8 @@ def test_a_thread_that_starts_on_the_axis_moves():
     "name",
     [pytest.param(name, marks=[pytest.mark.slow] * (name == "compliance")) for name in OBJECTIVES],
 )
-def test_gradients_of_objectives_are_their_differences(scene, tips, name):
-    """By radius, angle and all inputs, with constraints beside; differences of the objective
-    alone."""
+def test_gradients_of_objectives_against_differences(scene, tips, name):
+    """With respect to radius, angle and all inputs."""
     free = {"actuators[*].routing.radius": (0.002, 0.009), "inputs": (0.1, 5.0)}
     _, terms, given = formulate(scene, free, OBJECTIVES[name](tips), SETS, (), {}, MODEL)
     value = jax.jit(lambda free: terms(free)[0])
@@ -137,7 +136,7 @@ def test_values_of_objectives(scene, tips):
     assert float((3 * TipError(wanted))(arms)) == pytest.approx(3 * float(TipError(wanted)(arms)))
 
 
-def test_margins_of_constraints_by_other_code(scene):
+def test_margins_of_constraints_against_independent_code(scene):
     arms = formulate(scene, FREE, Tension(1.0), SETS, (), {}, MODEL)[1].arms({}, {})
     phases = 0.3, 2.0
     assert float(jnp.min(MinSpacing(0.004)(arms))) == pytest.approx(
@@ -154,7 +153,7 @@ def test_margins_of_constraints_by_other_code(scene):
     )
     assert float(jnp.min(StabilityMargin(0.5)(arms))) == pytest.approx(
         0.5
-    )  # pulled threads alone: 1
+    )  # it is 1 under tendon tension alone
 
 
 @pytest.fixture(scope="module")
@@ -188,7 +187,7 @@ def test_a_hidden_routing_is_found(found):
     assert found.objective == min(start.objective for start in found.starts if start.violation <= 0)
 
 
-def test_what_is_found_is_a_scene_that_can_be_kept_and_solved_again(found, tips):
+def test_a_design_survives_a_scene_file(found, tips):
     from vsr_jax.files.scene_file import parse_scene, to_toml
 
     again = parse_scene(to_toml(found.scene, found.inputs[0])).scene
@@ -198,8 +197,7 @@ def test_what_is_found_is_a_scene_that_can_be_kept_and_solved_again(found, tips)
 
 
 def test_constraints_hold_where_they_bind():
-    """A thread drawn to the wall and a tension as high as it may be: both end at their limits, and
-    inside."""
+    """The optimum lies at the wall and at the largest tension; both constraints hold there."""
     scene = vsr.Scene(arm().rod, [vsr.Tendon(vsr.Parallel(0.003, 0.0))])
     free = {"actuators[0].routing.y": (0.0, 0.02), "inputs": (0.1, 9.0)}
     high = Measure(lambda arms: -jnp.mean(arms.each(lambda eq: eq.tip[1, 3])) / LENGTH)
@@ -218,7 +216,7 @@ def test_constraints_hold_where_they_bind():
     assert set(found.margins) == {"Inside(wall=0.002)", "MaxTension(force=1.5)"}
     assert all(0 <= margin < 5e-3 for margin in found.margins.values())
     y, T = float(found.scene.actuators[0].routing.y), float(found.inputs[0, 0])
-    assert 0.99 * 0.008 < y <= 0.008  # the radius at the tip, less the wall
+    assert 0.99 * 0.008 < y <= 0.008  # radius at the tip minus the wall
     assert 0.99 * 1.5 < T <= 1.5
 
 
@@ -235,7 +233,7 @@ def test_an_uncertain_design_is_the_mean_over_its_draws(scene, tips):
     assert float(terms(given)[0]) == pytest.approx(np.mean(alone))
 
 
-def test_a_design_that_was_killed_resumes_bit_identically(scene, tips, tmp_path, monkeypatch):
+def test_an_interrupted_design_resumes_bit_identically(scene, tips, tmp_path, monkeypatch):
     search = {"starts": 2, "steps": 60, "candidates": 2}
 
     def run(out=None, **changes):
@@ -270,7 +268,7 @@ def test_a_design_that_was_killed_resumes_bit_identically(scene, tips, tmp_path,
             run(out, **other)
 
 
-def test_it_stops_when_it_is_good_enough(scene, tips):
+def test_it_stops_at_a_given_objective(scene, tips):
     search = vsr.Search(starts=2, steps=60, candidates=2, stop_at=10.0)
     found = vsr.design(
         scene, FREE, TipError(tips), SETS, model=MODEL, search=search, progress=False
@@ -278,7 +276,7 @@ def test_it_stops_when_it_is_good_enough(scene, tips):
     assert len(found.history.objective) == 25
 
 
-def test_it_stops_when_it_gains_no_more():
+def test_it_stops_when_the_objective_stagnates():
     falls = np.concatenate([np.linspace(2, 1, 50), np.full(50, 1.0)])[:, None]
     feasible, violated = History(falls, 0 * falls), History(falls, 0 * falls + 1)
     assert vsr.Search(patience=30).finished(feasible)
@@ -308,8 +306,8 @@ def test_another_optimiser_and_single_precision(scene, tips):
 
 
 @pytest.mark.slow
-def test_starts_that_cannot_be_solved_are_left_behind(scene):
-    """Half of the range of tensions collapses the arm."""
+def test_starts_without_equilibrium_are_recorded_as_nan(scene):
+    """The arm collapses in half of the range of tensions."""
     low = Measure(lambda arms: jnp.mean(arms.each(lambda eq: eq.tip[0, 3])) / LENGTH)
     search = vsr.Search(starts=3, steps=30, candidates=4)
     settings = {"model": MODEL, "search": search, "progress": False}
@@ -343,7 +341,7 @@ def test_starts_that_cannot_be_solved_are_left_behind(scene):
         ({"out": "nowhere/at/all"}, "need a file in an existing folder"),
     ],
 )
-def test_errors_name_what_came_and_what_is_needed(unchecked, scene, change, message):
+def test_errors_name_the_value_and_the_requirement(unchecked, scene, change, message):
     arguments = {
         "free": FREE,
         "objective": Tension(1.0),
@@ -380,7 +378,7 @@ def test_errors_name_what_came_and_what_is_needed(unchecked, scene, change, mess
         (lambda: vsr.Search(patience=0), "Search.patience: got 0, need an integer >= 1"),
     ],
 )
-def test_objectives_and_constraints_refuse_what_makes_no_sense(unchecked, make, message):
+def test_invalid_settings_are_rejected(unchecked, make, message):
     with pytest.raises(ValueError, match=message):
         make()
 
@@ -400,7 +398,7 @@ def test_a_design_prints_its_numbers_with_units(found):
     assert "routing.angle = " in shapes[0]
 
 
-def test_arms_are_solved_side_by_side(scene):
+def test_arms_have_one_equilibrium_per_set(scene):
     arms = formulate(scene, FREE, Tension(1.0), SETS, (), {}, MODEL)[1].arms({}, {})
     assert isinstance(arms, Arms)
     assert arms.each(lambda eq: eq.tip).shape == (4, 4, 4)

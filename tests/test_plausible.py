@@ -1,4 +1,4 @@
-"""Warnings of implausible numbers: what they name and guess, and that ordinary arms have none."""
+"""Warnings about implausible numbers: names, guessed units, none for ordinary arms."""
 
 import pathlib
 
@@ -79,7 +79,7 @@ def arm(
     ],
     ids=lambda value: " ".join(value) if isinstance(value, dict) else "",
 )
-def test_a_slip_of_unit_is_named(numbers, sentence):
+def test_a_wrong_unit_is_named(numbers, sentence):
     found = plausible.warnings_of(arm(**numbers))
     assert len(found) == 1
     assert found[0].startswith(sentence)
@@ -139,7 +139,7 @@ def test_the_health_of_a_solve_has_the_warnings(helix):
     [["solve"], ["check"], ["sweep"], ["reach", "--target", "0.1", "0", "0"]],
     ids=lambda x: x[0],
 )
-def test_commands_warn_on_stderr_before_they_begin(arguments, tmp_path, capsys):
+def test_commands_warn_on_stderr_before_solving(arguments, tmp_path, capsys):
     path = tmp_path / "arm.toml"
     path.write_text(HELIX.replace("length = 0.75", "length = 400"))
     name, *more = arguments
@@ -153,7 +153,7 @@ def test_commands_warn_on_stderr_before_they_begin(arguments, tmp_path, capsys):
     assert out == ""
 
 
-def test_design_warns_on_stderr_before_it_begins(tmp_path, capsys, monkeypatch):
+def test_design_warns_on_stderr_before_solving(tmp_path, capsys, monkeypatch):
     def design(*_, **__):
         raise ValueError("not now")
 

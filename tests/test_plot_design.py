@@ -1,5 +1,5 @@
-"""Pictures of designs, films, what is drawn onto arms; problems of design as files and the command
-that reads them."""
+"""Figures of designs, animations, annotations of arms; design files and the command that reads
+them."""
 
 import json
 
@@ -79,23 +79,23 @@ def closed():
 
 
 def arrows(ax):
-    """Number of lines of every bundle of arrows in 3D axes."""
+    """Number of lines in each group of arrows in 3D axes."""
     return [len(bundle._segments3d) for bundle in ax.collections if hasattr(bundle, "_segments3d")]
 
 
 def test_frames_and_loads_are_drawn_onto_an_arm(eq):
     ax = annotate.frames(eq, plot.arm(eq), stations=5)
-    assert arrows(ax) == [15, 15, 15]  # a shaft and two lines of a head each
+    assert arrows(ax) == [15, 15, 15]  # one shaft and two lines of the head per arrow
     loaded = annotate.loads(eq)
-    assert len(loaded.collections) == 2  # twelve arrows of weight, one at the tip
-    assert loaded.zz_dataLim.x0 < -0.26  # all of them in the picture, with their ends
+    assert len(loaded.collections) == 2  # twelve arrows of the weight, one at the tip
+    assert loaded.zz_dataLim.x0 < -0.26  # the limits include all arrow heads
     assert loaded.zz_dataLim.x1 > -0.001
     weight, tip = annotate._forces(eq, 0.3)
     np.testing.assert_allclose(weight[1], [[0, 0, -9.81 * 1000 * np.pi * 1e-4]] * 12, rtol=1e-6)
     np.testing.assert_allclose(tip[1][0], 0.02 * np.asarray(eq.tip)[:3, 2], rtol=1e-6)
 
 
-def test_an_ellipsoid_has_the_size_it_says():
+def test_an_ellipsoid_has_its_semi_axes():
     ax = annotate.ellipsoid(
         vsr.Ellipsoid(jnp.array([1.0, 0.0, 0.0]), jnp.diag(jnp.array([0.5, 0.2, 0.1]))), scale=2.0
     )
@@ -113,7 +113,7 @@ def test_a_film_has_a_frame_for_each_arm(eq, tmp_path):
         film([eq, eq], titles=["a"])
 
 
-def test_a_problem_file_is_designed_kept_and_drawn(problem, tmp_path, capsys, monkeypatch):
+def test_the_command_designs_saves_and_draws(problem, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(cli_design, "reduce_compile_time", lambda optimise: None)
     out, record, picture = (
         tmp_path / name for name in ("designed.toml", "design.json", "design.png")
@@ -162,13 +162,13 @@ def test_a_history_marks_the_best_start(problem):
         ("steps = 4", "optimizer = 1", r"search: got .*, need a table of numbers"),
     ],
 )
-def test_errors_of_problem_files_name_file_and_place(unchecked, problem, old, new, message):
+def test_errors_of_design_files_name_file_and_key(unchecked, problem, old, new, message):
     problem.write_text(PROBLEM.replace(old, new, 1))
     with pytest.raises(ValueError, match=rf"problem.toml: .*{message}"):
         load_design(problem)
 
 
-def test_what_the_command_refuses_is_one_line(problem, capsys):
+def test_errors_of_the_command_are_one_line(problem, capsys):
     problem.write_text(PROBLEM.replace("[0.001, 0.009]", "[0.009, 0.001]"))
     assert cli.main(["design", str(problem)]) == 2
     assert capsys.readouterr().err.startswith(

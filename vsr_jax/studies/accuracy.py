@@ -218,9 +218,8 @@ def measure(
         jobs = Timed(tip, batch[0], calls=_SINGLES), Timed(jax.vmap(tip), batch)
         return jobs, _shape_program(arm, batch[:FEW], setting.model)
 
-    with ThreadPoolExecutor(
-        os.cpu_count()
-    ) as pool:  # one program is traced while another is compiled
+    # one program is traced while another is compiled
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
         prepared = list(pool.map(prepare, measured))
     errors = [_errors(scene, inputs[:FEW], program.shapes(), true) for _, program in prepared]
     report("timing all settings")

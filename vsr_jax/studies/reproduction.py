@@ -103,9 +103,8 @@ def compare(
         for case, _, model, solution in tqdm(work, "solves", disable=not progress)
     ]
     groups = _by_program(solved)
-    with ThreadPoolExecutor(
-        2
-    ) as pool:  # mostly compiling; programs that run in parallel can deadlock
+    # two threads, since compiling dominates; more programs that run in parallel could deadlock
+    with ThreadPoolExecutor(2) as pool:
         programs = list(
             tqdm(pool.map(_program, groups), "curves", len(groups), disable=not progress)
         )
