@@ -25,7 +25,7 @@ def scene():
 
 @pytest.fixture(scope="module")
 def reached(scene):
-    """Random inputs; targets: their tips, one out of reach by 20 um, one far out of reach; results."""
+    """Random inputs; targets: their tips, one out of reach by 20 um, one by far; results."""
     drawn = jnp.asarray(np.random.default_rng(3).uniform(0.2, MOST, (7, 3)))
     tips = jax.vmap(lambda u: vsr.solve(scene, u, model=MODEL).tip[:3, 3])(drawn)
     targets = jnp.concatenate([tips, jnp.array([[0.75 + 2e-5, 0.0, 0.0], [2.0, 0.0, 0.0]])])
