@@ -64,8 +64,9 @@ def test_a_result_prints_what_the_command_prints(reached, scene):
     assert lines[1].endswith("m, within the 7.5e-05 m allowed")
     assert str(found).startswith("8 of 9 targets reached, largest miss 1.2 m")
     texts = []
-    jax.eval_shape(lambda x: texts.append(str(x)) or x.miss, one)
+    shapes = jax.eval_shape(lambda x: texts.append(str(x)) or x, one)
     assert texts[0].startswith("Reach(inputs=")
+    assert str(shapes).startswith("Reach(inputs=")
 
 
 def test_a_miss_below_the_allowed_one_counts_as_reached(reached):

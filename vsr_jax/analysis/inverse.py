@@ -57,7 +57,8 @@ class Reach(NamedTuple):
     allowed_miss: Scalar
 
     def __str__(self) -> str:
-        if is_traced(self.inputs):
+        numbers = (self.inputs, self.miss, self.reached, self.allowed_miss)
+        if not all(eqx.is_array_like(x) and not is_traced(x) for x in numbers):
             return f"Reach(inputs={self.inputs}, miss={self.miss})"
         if self.inputs.ndim > 1:
             worst = float(np.max(np.asarray(self.miss)))

@@ -11,6 +11,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 from jax.typing import ArrayLike
@@ -86,8 +87,9 @@ class Design(NamedTuple):
             f"{len(self.starts)} starts"
         ]
         lines += [
-            f"{name} = {_text(value)} [{known[name].unit or '?'}]"
-            for name, value in self.numbers.items()
+            f"{name} = {_text(known[name].value)} [{known[name].unit or '?'}]"
+            for name in self.free
+            if name in known
         ]
         if INPUTS in self.free:
             lines.append(f"inputs     {_rows(self.inputs)}")
@@ -101,13 +103,13 @@ class Design(NamedTuple):
 
 
 def _text(value: Array) -> str:
-    if is_traced(value):
+    if is_traced(value) or not eqx.is_array_like(value):
         return str(value)
     return np.array2string(np.asarray(value), precision=6, separator=", ")
 
 
 def _rows(inputs: Array) -> str:
-    if is_traced(inputs) or inputs.ndim != 2:
+    if is_traced(inputs) or not eqx.is_array_like(inputs) or np.ndim(inputs) != 2:
         return _text(inputs)
     return "; ".join(", ".join(f"{x:.6g}" for x in row) for row in np.asarray(inputs))
 
