@@ -97,7 +97,7 @@ STUDIES: dict[str, Callable[[], Study]] = {
 }
 
 
-def run(name: str, batch_size: int) -> list[accuracy.Row]:
+def run(name: str, batch_size: int) -> list[accuracy.AccuracyRow]:
     """The rows of one scene, printed as they come."""
     study = STUDIES[name]()
     inputs = jnp.asarray(
@@ -107,7 +107,7 @@ def run(name: str, batch_size: int) -> list[accuracy.Row]:
     if study.sparse:
         ways = [way for way in ways if (way.family, way.label) in SPARSE]
     rows = accuracy.measure(
-        study.scene, inputs, ways, say=lambda way: print(f"{name}: {way}", file=sys.stderr)
+        study.scene, inputs, ways, report=lambda way: print(f"{name}: {way}", file=sys.stderr)
     )
     print(
         "\n".join([f"\n## {name}\n", *accuracy.table(rows), "", *accuracy.advice(rows)]), flush=True
@@ -230,7 +230,7 @@ def stiff(calls: int = 5) -> dict[str, Any]:
 
 
 def draw(
-    rows: dict[str, list[accuracy.Row]], folder: Path, others: dict[str, dict[str, Any]]
+    rows: dict[str, list[accuracy.AccuracyRow]], folder: Path, others: dict[str, dict[str, Any]]
 ) -> None:
     for file, (error, time) in FIGURES.items():
         known = others if (error, time) == ("tip", "batch_us") else None
@@ -272,7 +272,7 @@ def main() -> None:
     if file:
         file.write_text(json.dumps(content, indent=1) + "\n")
     if options.plots:
-        rows = {name: [accuracy.Row(**row) for row in some] for name, some in done.items()}
+        rows = {name: [accuracy.AccuracyRow(**row) for row in some] for name, some in done.items()}
         draw(rows, Path(options.plots), peers(options.peers))
 
 

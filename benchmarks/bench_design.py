@@ -21,8 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import vsr_jax as vsr
-from vsr_jax.optimization.descent import adam, begin, descend, weight
-from vsr_jax.optimization.problem import posed
+from vsr_jax.optimization.descent import adam, begin, descend, penalty_weight
+from vsr_jax.optimization.problem import formulate
 from vsr_jax.studies.timing import Timed, machine, take_turns
 
 MODEL = vsr.StrainDependent(12)
@@ -83,10 +83,7 @@ def found(seed: int, starts: int) -> dict[str, Any]:
         wanted,
         TENSIONS,
         model=MODEL,
-        starts=starts + 1,
-        steps=STEPS,
-        candidates=TRIED,
-        seed=seed,
+        search=vsr.Search(starts=starts + 1, steps=STEPS, candidates=TRIED, seed=seed),
         progress=False,
     )
     seconds = time.perf_counter() - start
@@ -105,10 +102,10 @@ def found(seed: int, starts: int) -> dict[str, Any]:
 
 def step_cost(starts: int, rounds: int) -> dict[str, Any]:
     """Times [us] of a step of all starts, and of the objective alone, whose solves a step needs."""
-    problem, _, given = posed(unknowing(), FREE, shapes(hidden(0)), TENSIONS, (), {}, MODEL)
+    problem, _, given = formulate(unknowing(), FREE, shapes(hidden(0)), TENSIONS, (), {}, MODEL)
     optimizer = adam(0.05, STEPS)
     states = begin(problem, optimizer, given, starts, 4, 0)
-    penalty = weight(0, STEPS)
+    penalty = penalty_weight(0, STEPS)
     step = Timed(lambda states: descend(problem, optimizer, states, penalty), states)
     alone = Timed(lambda z: jax.vmap(lambda z: problem.loss(z, penalty)[0])(z), states.z)
     take_turns([step, alone], rounds)

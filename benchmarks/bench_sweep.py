@@ -32,11 +32,11 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from matplotlib.figure import Figure
 
 import vsr_jax as vsr
-from vsr_jax.cli.common import one_device_a_core
+from vsr_jax.cli.common import one_device_per_core
 from vsr_jax.mechanics.balance import newton_step
 from vsr_jax.studies.timing import Timed, machine, take_turns
 
-one_device_a_core()
+one_device_per_core()
 
 SAMPLES = 16_384
 STEPS = 16

@@ -62,7 +62,7 @@ def follow_the_s() -> tuple[vsr.Design, dict[str, Any]]:
         [[5.0]],
         constraints=[INSIDE],
         model=MODEL,
-        steps=800,
+        search=vsr.Search(steps=800),
     )
     seconds = time.perf_counter() - start
     X = LENGTH * jnp.arange(1, 201) / 200
@@ -100,8 +100,7 @@ def along_the_line() -> tuple[vsr.Design, dict[str, Any]]:
         (low + high) / 2,
         constraints=[INSIDE],
         model=MODEL,
-        starts=16,
-        steps=1500,
+        search=vsr.Search(starts=16, steps=1500),
     )
     seconds = time.perf_counter() - start
     tips = line_tips(found, 200)

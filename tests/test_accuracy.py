@@ -1,4 +1,4 @@
-"""The study of what accuracy costs: its errors against the reference solutions and against
+"""The study of accuracy against time: its errors against the reference solutions and finite
 differences of finer solves."""
 
 import json
@@ -65,10 +65,10 @@ def test_gradient_error_against_central_differences_at_ten_times_the_steps(rows)
     assert float(gradient_error(found, true, values)) == pytest.approx(rows[0].gradient, rel=0.02)
 
 
-def test_words_and_table(rows):
+def test_advice_and_table(rows):
     text = accuracy.advice(rows)
     assert text[0].startswith("for 1 mm use steps of order 6, 8")
-    assert text[1] == "for 1 um: nothing measured here"
+    assert text[1] == "for 1 um: no measured setting is accurate enough"
     assert len(accuracy.table(rows)) == 4
     assert accuracy.cheapest(rows, 1e-9) is None
 
@@ -94,9 +94,9 @@ def test_settings_span_the_models():
 
 
 def test_the_command(tmp_path, capsys, monkeypatch, rows):
-    def measure(scene, inputs, ways, say):
+    def measure(scene, inputs, settings, report):
         assert inputs.shape == (2, 2)
-        assert {way.family for way in ways} == {
+        assert {way.family for way in settings} == {
             "steps of order 2",
             "steps of order 4",
             "steps of order 6",

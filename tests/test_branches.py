@@ -1,5 +1,4 @@
-"""Branches: a heavy column whose clamp is turned from one side to the other leans on until it
-snaps."""
+"""Branches of equilibria: a heavy column snaps over as its clamp rotates; Euler's column."""
 
 import jax
 import jax.numpy as jnp
@@ -10,11 +9,11 @@ import vsr_jax as vsr
 
 MODEL = vsr.StrainDependent(6)
 PLANE = ("bending_y", "elongation", "shear_z")
-SWAY = np.pi / 3  # the clamp leans by this to either side of the vertical
+SWAY = np.pi / 3  # largest angle of the clamp from the vertical
 
 
 def column(s, density=478.0):
-    """Twelve times $EI / L^3$ heavy, above Greenhill's 7.84: upright it cannot stand. Planar."""
+    """Planar column of weight 12 EI / L^2, above Greenhill's 7.84: unstable when upright."""
     lean = (2 * s - 1) * SWAY
     axes = jnp.array(
         [[jnp.sin(lean), 0, -jnp.cos(lean)], [0, 1, 0], [jnp.cos(lean), 0, jnp.sin(lean)]]
@@ -37,7 +36,7 @@ def snap():
     return branch, np.asarray(branch.parameter), np.asarray(tips), np.asarray(margin)
 
 
-def test_branch_turns_back_twice_and_ends_where_the_path_does(snap):
+def test_the_branch_has_two_limit_points_and_ends_with_the_path(snap):
     branch, s, _, _ = snap
     assert np.all(branch.equilibria.converged)
     turns = np.flatnonzero(np.diff(np.sign(np.diff(s))[np.diff(s) != 0]))
@@ -46,7 +45,7 @@ def test_branch_turns_back_twice_and_ends_where_the_path_does(snap):
     assert s[-1] == 1
 
 
-def test_it_is_stable_but_between_the_limit_points(snap):
+def test_it_is_unstable_between_the_limit_points(snap):
     _, s, _, margin = snap
     falling = np.diff(s) < 0
     inside = np.flatnonzero(falling)
@@ -55,7 +54,7 @@ def test_it_is_stable_but_between_the_limit_points(snap):
     assert np.all(margin[outside] > 0)
 
 
-def test_it_is_its_own_mirror_image(snap):
+def test_it_is_symmetric(snap):
     branch, s, _, _ = snap
     lean = np.asarray(
         jax.vmap(lambda eq: jnp.arctan2(eq.tip[0, 0], eq.tip[2, 0]))(branch.equilibria)
@@ -67,7 +66,7 @@ def test_it_is_its_own_mirror_image(snap):
     np.testing.assert_allclose(1 - mirrored, s[:last], atol=2e-3)
 
 
-def test_its_stable_equilibria_are_those_of_a_solve(snap):
+def test_its_stable_equilibria_agree_with_solve(snap):
     _, s, tips, _ = snap
     single = jax.jit(lambda s: vsr.solve(column(s), no_inputs(s), model=MODEL).tip[:3, 3])
     for i in (3, 5):
@@ -75,7 +74,7 @@ def test_its_stable_equilibria_are_those_of_a_solve(snap):
 
 
 @pytest.mark.slow
-def test_derivatives_are_those_at_fixed_parameter():
+def test_derivatives_are_taken_at_fixed_parameter():
     def traced(density):
         branch = vsr.follow_branch(lambda s: column(s, density), no_inputs, model=MODEL, points=3)
         return jax.vmap(lambda eq: eq.tip[0, 3])(branch.equilibria)[1], branch.parameter[1]
@@ -88,7 +87,7 @@ def test_derivatives_are_those_at_fixed_parameter():
 
 
 @pytest.mark.slow
-def test_a_path_without_a_start_says_so_at_all_points():
+def test_all_points_have_the_status_of_a_failed_start():
     rod = vsr.Rod(0.3, vsr.Circular(0.01), vsr.Material(1e6, poisson=0.45))
     scene = vsr.Scene(rod, [vsr.Tendon(vsr.Parallel(0.0, 0.0))])
     branch = vsr.follow_branch(
@@ -98,7 +97,7 @@ def test_a_path_without_a_start_says_so_at_all_points():
 
 
 @pytest.mark.slow
-def test_both_branches_of_eulers_column_end_where_a_solve_does():
+def test_both_branches_of_eulers_column_agree_with_solve():
     def ends(side):
         def pressed(s):
             rod = vsr.Rod(0.4, vsr.Circular(0.01), vsr.Material(1e6, poisson=0.45))
@@ -113,7 +112,7 @@ def test_both_branches_of_eulers_column_end_where_a_solve_does():
         assert branch.parameter[-1] == 1
         tips, margin = jax.vmap(lambda eq: (eq.tip[:3, 3], eq.stability))(branch.equilibria)
         assert np.all(margin > 0)
-        assert np.min(margin) < 0.05  # near the load at which the perfect column is indifferent
+        assert np.min(margin) < 0.05  # near the critical load of the perfect column
         return np.asarray(tips[-1]), np.asarray(
             vsr.solve(pressed(1.0), jnp.zeros(0), model=MODEL).tip[:3, 3]
         )
@@ -147,6 +146,6 @@ def test_tensions_and_lengths_along_a_path():
         ({"model": vsr.Prescribed(vsr.Basis.uniform(vsr.Legendre(1)))}, "model"),
     ],
 )
-def test_bad_arguments_are_refused(unchecked, arguments, words):
+def test_invalid_arguments_are_rejected(unchecked, arguments, words):
     with pytest.raises(ValueError, match=words):
         vsr.follow_branch(column, no_inputs, **arguments)

@@ -1,6 +1,7 @@
-"""Design by gradient: what was hidden is found, constraints hold by other code, a design that was
-killed goes on."""
+"""Design by gradient: hidden routings are found, constraints hold by independent code, an
+interrupted design resumes."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,8 +17,7 @@ from vsr_jax.optimization.constraint import (
     MinSpacing,
     StabilityMargin,
 )
-from vsr_jax.optimization.descent import Trace
-from vsr_jax.optimization.design_search import _Stop
+from vsr_jax.optimization.descent import History
 from vsr_jax.optimization.objective import (
     Arms,
     CurveError,
@@ -27,7 +27,7 @@ from vsr_jax.optimization.objective import (
     TipError,
     Workspace,
 )
-from vsr_jax.optimization.problem import posed
+from vsr_jax.optimization.problem import formulate
 
 MODEL = vsr.StrainDependent(6)
 LENGTH = 0.3
@@ -73,31 +73,37 @@ OBJECTIVES = {
 }
 
 
-def test_a_thread_that_starts_on_the_axis_moves():
-    """There the distance to the axis has no derivative, and Inside had the slope NaN."""
+def test_a_thread_leaves_the_axis():
+    """On the axis the distance to it has no derivative; the gradient of Inside was NaN."""
     start = vsr.Scene(arm().rod, [vsr.Tendon(vsr.Parallel(0.0, 0.0))])
     aim = vsr.solve(
         vsr.Scene(arm().rod, [vsr.Tendon(vsr.Parallel(0.003, 0.002))]), [2.0], model=MODEL
     ).tip[:3, 3]
     free = {f"actuators[0].routing.{axis}": (-0.008, 0.008) for axis in "yz"}
-    settings = {"model": MODEL, "starts": 1, "steps": 60, "candidates": 1, "progress": False}
+    search = vsr.Search(starts=1, steps=60, candidates=1)
     found = vsr.design(
-        start, free, TipError(aim[None]), [[2.0]], constraints=[Inside(0.0005)], **settings
+        start,
+        free,
+        TipError(aim[None]),
+        [[2.0]],
+        constraints=[Inside(0.0005)],
+        model=MODEL,
+        search=search,
+        progress=False,
     )
     routing = found.scene.actuators[0].routing
     np.testing.assert_allclose([routing.y, routing.z], [0.003, 0.002], atol=5e-4)
-    assert np.all(np.isfinite(found.trace.objective))
+    assert np.all(np.isfinite(found.history.objective))
 
 
 @pytest.mark.parametrize(
     "name",
     [pytest.param(name, marks=[pytest.mark.slow] * (name == "compliance")) for name in OBJECTIVES],
 )
-def test_gradients_of_objectives_are_their_differences(scene, tips, name):
-    """By radius, angle and all inputs, with constraints beside; differences of the objective
-    alone."""
+def test_gradients_of_objectives_against_differences(scene, tips, name):
+    """With respect to radius, angle and all inputs."""
     free = {"actuators[*].routing.radius": (0.002, 0.009), "inputs": (0.1, 5.0)}
-    _, terms, given = posed(scene, free, OBJECTIVES[name](tips), SETS, (), {}, MODEL)
+    _, terms, given = formulate(scene, free, OBJECTIVES[name](tips), SETS, (), {}, MODEL)
     value = jax.jit(lambda free: terms(free)[0])
     slope = jax.jit(jax.grad(lambda free: terms(free)[0]))(given)
     for key, place in (("actuators[0].routing.radius", ()), ("inputs", (1, 0)), ("inputs", (2, 1))):
@@ -115,7 +121,7 @@ def test_gradients_of_objectives_are_their_differences(scene, tips, name):
 
 
 def test_values_of_objectives(scene, tips):
-    arms = posed(scene, FREE, Tension(1.0), SETS, (), {}, MODEL)[1].arms({}, {})
+    arms = formulate(scene, FREE, Tension(1.0), SETS, (), {}, MODEL)[1].arms({}, {})
     own = np.array([vsr.solve(scene, jnp.array(u), model=MODEL).tip[:3, 3] for u in SETS])
     wanted = np.asarray(tips[:, :3, 3])
     assert float(TipError(wanted)(arms)) == pytest.approx(
@@ -130,8 +136,8 @@ def test_values_of_objectives(scene, tips):
     assert float((3 * TipError(wanted))(arms)) == pytest.approx(3 * float(TipError(wanted)(arms)))
 
 
-def test_margins_of_constraints_by_other_code(scene):
-    arms = posed(scene, FREE, Tension(1.0), SETS, (), {}, MODEL)[1].arms({}, {})
+def test_margins_of_constraints_against_independent_code(scene):
+    arms = formulate(scene, FREE, Tension(1.0), SETS, (), {}, MODEL)[1].arms({}, {})
     phases = 0.3, 2.0
     assert float(jnp.min(MinSpacing(0.004)(arms))) == pytest.approx(
         (2 * 0.005 * np.sin((phases[1] - phases[0]) / 2)) ** 2 / 0.004**2 - 1
@@ -147,7 +153,7 @@ def test_margins_of_constraints_by_other_code(scene):
     )
     assert float(jnp.min(StabilityMargin(0.5)(arms))) == pytest.approx(
         0.5
-    )  # pulled threads alone: 1
+    )  # it is 1 under tendon tension alone
 
 
 @pytest.fixture(scope="module")
@@ -164,9 +170,7 @@ def found(scene):
         SETS,
         constraints=[Inside(0.0005)],
         model=MODEL,
-        starts=4,
-        steps=600,
-        candidates=8,
+        search=vsr.Search(starts=4, steps=600, candidates=8),
         progress=False,
     )
 
@@ -178,12 +182,12 @@ def test_a_hidden_routing_is_found(found):
         assert float(thread.routing.radius) == pytest.approx(0.006, abs=1e-6)
         assert float(thread.routing.angle) == pytest.approx(1.47, abs=1e-4)
         assert np.cos(float(thread.routing.phase) - phase) == pytest.approx(1, abs=1e-8)
-    assert found.trace.objective.shape == (600, 4)
+    assert found.history.objective.shape == (600, 4)
     assert len(found.starts) == 4
     assert found.objective == min(start.objective for start in found.starts if start.violation <= 0)
 
 
-def test_what_is_found_is_a_scene_that_can_be_kept_and_solved_again(found, tips):
+def test_a_design_survives_a_scene_file(found, tips):
     from vsr_jax.files.scene_file import parse_scene, to_toml
 
     again = parse_scene(to_toml(found.scene, found.inputs[0])).scene
@@ -193,8 +197,7 @@ def test_what_is_found_is_a_scene_that_can_be_kept_and_solved_again(found, tips)
 
 
 def test_constraints_hold_where_they_bind():
-    """A thread drawn to the wall and a tension as high as it may be: both end at their limits, and
-    inside."""
+    """The optimum lies at the wall and at the largest tension; both constraints hold there."""
     scene = vsr.Scene(arm().rod, [vsr.Tendon(vsr.Parallel(0.003, 0.0))])
     free = {"actuators[0].routing.y": (0.0, 0.02), "inputs": (0.1, 9.0)}
     high = Measure(lambda arms: -jnp.mean(arms.each(lambda eq: eq.tip[1, 3])) / LENGTH)
@@ -206,23 +209,21 @@ def test_constraints_hold_where_they_bind():
         [[1.0]],
         constraints=kept,
         model=MODEL,
-        starts=2,
-        steps=200,
-        candidates=4,
+        search=vsr.Search(starts=2, steps=200, candidates=4),
         progress=False,
     )
     assert found.feasible
     assert set(found.margins) == {"Inside(wall=0.002)", "MaxTension(force=1.5)"}
     assert all(0 <= margin < 5e-3 for margin in found.margins.values())
     y, T = float(found.scene.actuators[0].routing.y), float(found.inputs[0, 0])
-    assert 0.99 * 0.008 < y <= 0.008  # the radius at the tip, less the wall
+    assert 0.99 * 0.008 < y <= 0.008  # radius at the tip minus the wall
     assert 0.99 * 1.5 < T <= 1.5
 
 
 def test_an_uncertain_design_is_the_mean_over_its_draws(scene, tips):
     uncertain = {"rod.material.young": 0.1}
-    _, terms, given = posed(scene, FREE, TipError(tips), SETS, (), uncertain, MODEL)
-    one = posed(scene, FREE, TipError(tips), SETS, (), {}, MODEL)[1]
+    _, terms, given = formulate(scene, FREE, TipError(tips), SETS, (), uncertain, MODEL)
+    one = formulate(scene, FREE, TipError(tips), SETS, (), {}, MODEL)[1]
     factors = np.asarray(terms.factors["rod.material.young"])
     assert factors.shape == (8,)
     np.testing.assert_allclose(np.prod(factors), 1, rtol=1e-12)  # each draw with its opposite
@@ -232,70 +233,88 @@ def test_an_uncertain_design_is_the_mean_over_its_draws(scene, tips):
     assert float(terms(given)[0]) == pytest.approx(np.mean(alone))
 
 
-def test_a_design_that_was_killed_goes_on_to_the_bit(scene, tips, tmp_path, monkeypatch):
-    settings = {"model": MODEL, "starts": 2, "steps": 60, "candidates": 2, "progress": False}
-    whole = vsr.design(scene, FREE, TipError(tips), SETS, **settings)
+def test_an_interrupted_design_resumes_bit_identically(scene, tips, tmp_path, monkeypatch):
+    search = {"starts": 2, "steps": 60, "candidates": 2}
+
+    def run(out=None, **changes):
+        return vsr.design(
+            scene,
+            FREE,
+            TipError(tips),
+            SETS,
+            model=MODEL,
+            search=vsr.Search(**search | changes),
+            out=out,
+            progress=False,
+        )
+
+    whole = run()
     out, write = tmp_path / "design.eqx", checkpoint.Checkpoint.write
 
-    def dies(self, states, trace):
-        write(self, states, trace)
-        if len(trace.objective) >= 50:
+    def dies(self, states, history):
+        write(self, states, history)
+        if len(history.objective) >= 50:
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
         patch.setattr(checkpoint.Checkpoint, "write", dies)
         with pytest.raises(KeyboardInterrupt):
-            vsr.design(scene, FREE, TipError(tips), SETS, out=out, **settings)
-    resumed = vsr.design(scene, FREE, TipError(tips), SETS, out=out, **settings)
-    np.testing.assert_array_equal(resumed.trace.objective, whole.trace.objective)
+            run(out)
+    resumed = run(out)
+    np.testing.assert_array_equal(resumed.history.objective, whole.history.objective)
     assert resumed.objective == whole.objective
     for other in ({"learning_rate": 0.01}, {"optimizer": optax.sgd(0.1)}):
-        with pytest.raises(ValueError, match="holds something else"):
-            vsr.design(scene, FREE, TipError(tips), SETS, out=out, **settings | other)
+        with pytest.raises(ValueError, match="belongs to another computation"):
+            run(out, **other)
 
 
-def test_it_stops_when_it_is_good_enough(scene, tips):
-    settings = {"model": MODEL, "starts": 2, "steps": 60, "candidates": 2, "progress": False}
-    assert (
-        len(vsr.design(scene, FREE, TipError(tips), SETS, enough=10.0, **settings).trace.objective)
-        == 25
+def test_it_stops_at_a_given_objective(scene, tips):
+    search = vsr.Search(starts=2, steps=60, candidates=2, stop_at=10.0)
+    found = vsr.design(
+        scene, FREE, TipError(tips), SETS, model=MODEL, search=search, progress=False
     )
+    assert len(found.history.objective) == 25
 
 
-def test_it_stops_when_it_gains_no_more():
+def test_it_stops_when_the_objective_stagnates():
     falls = np.concatenate([np.linspace(2, 1, 50), np.full(50, 1.0)])[:, None]
-    feasible, violated = Trace(falls, 0 * falls), Trace(falls, 0 * falls + 1)
-    assert _Stop(None, 30).says(feasible)
-    assert not _Stop(None, 60).says(feasible)
-    assert not _Stop(None, 30).says(violated)
-    assert _Stop(1.0, None).says(feasible)
-    assert not _Stop(1.0, None).says(violated)
+    feasible, violated = History(falls, 0 * falls), History(falls, 0 * falls + 1)
+    assert vsr.Search(patience=30).finished(feasible)
+    assert not vsr.Search(patience=60).finished(feasible)
+    assert not vsr.Search(patience=30).finished(violated)
+    assert vsr.Search(stop_at=1.0).finished(feasible)
+    assert not vsr.Search(stop_at=1.0).finished(violated)
+    assert vsr.Search(steps=100).finished(violated)
+    assert not vsr.Search(steps=101).finished(violated)
+    none = np.zeros((0, 1))
+    assert not vsr.Search(stop_at=1.0).finished(History(none, none))
 
 
 @pytest.mark.slow
 def test_another_optimiser_and_single_precision(scene, tips):
-    settings = {"model": MODEL, "starts": 1, "steps": 30, "candidates": 1, "progress": False}
     found = vsr.design(
         scene,
         FREE,
         TipError(tips.astype(jnp.float32)),
         np.float32(SETS),
-        optimizer=optax.sgd(0.5),
-        **settings,
+        model=MODEL,
+        search=vsr.Search(starts=1, steps=30, candidates=1, optimizer=optax.sgd(0.5)),
+        progress=False,
     )
     assert found.inputs.dtype == found.scene.rod.length.dtype == jnp.float32
-    assert found.objective < found.trace.objective[0, 0]
+    assert found.objective < found.history.objective[0, 0]
 
 
 @pytest.mark.slow
-def test_starts_that_cannot_be_solved_are_left_behind(scene):
-    """Half of the range of tensions collapses the arm."""
+def test_starts_without_equilibrium_are_recorded_as_nan(scene):
+    """The arm collapses in half of the range of tensions."""
     low = Measure(lambda arms: jnp.mean(arms.each(lambda eq: eq.tip[0, 3])) / LENGTH)
-    settings = {"model": MODEL, "starts": 3, "steps": 30, "candidates": 4, "progress": False}
+    search = vsr.Search(starts=3, steps=30, candidates=4)
+    settings = {"model": MODEL, "search": search, "progress": False}
     found = vsr.design(scene, {"inputs": (0.0, 300.0)}, low, SETS, **settings)
     assert found.feasible
-    assert np.isnan(found.trace.objective).any()
-    with pytest.raises(ValueError, match="not one start found an equilibrium"):
+    assert np.isnan(found.history.objective).any()
+    with pytest.raises(ValueError, match="no start found an equilibrium"):
         vsr.design(scene, {"inputs": (1e6, 2e6)}, low, [[1e6, 1e6]], **settings)
 
 
@@ -318,10 +337,11 @@ def test_starts_that_cannot_be_solved_are_left_behind(scene):
         ({"inputs": [1.0, 2.0]}, r"inputs: got shape \(2,\), need \(sets, 2\)"),
         ({"constraints": [3]}, r"constraints\[0\]: got 3, need a Constraint"),
         ({"uncertain": {"rod.length": -1.0}}, "need a finite number > 0"),
-        ({"out": "nowhere/at/all"}, "need a file in a folder that is there"),
+        ({"search": 3}, "search: got 3, need a Search"),
+        ({"out": "nowhere/at/all"}, "need a file in an existing folder"),
     ],
 )
-def test_errors_name_what_came_and_what_is_needed(unchecked, scene, change, message):
+def test_errors_name_the_value_and_the_requirement(unchecked, scene, change, message):
     arguments = {
         "free": FREE,
         "objective": Tension(1.0),
@@ -348,17 +368,37 @@ def test_errors_name_what_came_and_what_is_needed(unchecked, scene, change, mess
             r"CurveError.X: got \[0.0\], need finite numbers of shape \(1,\) > 0",
         ),
         (lambda: Workspace(4), "need 1, 2 or 3"),
-        (lambda: TipCompliance((0.0, 0.0, 0.0)), "need a vector that is not"),
+        (lambda: TipCompliance((0.0, 0.0, 0.0)), "need a nonzero vector"),
         (lambda: Inside(-0.1), "Inside.wall"),
         (lambda: Tension(1.0) + 3, "another objective to add"),
+        (lambda: vsr.Search(starts=0), "Search.starts: got 0, need an integer >= 1"),
+        (lambda: vsr.Search(learning_rate=-1.0), "Search.learning_rate: got -1.0, need a finite"),
+        (lambda: vsr.Search(seed=-1), "Search.seed: got -1, need an integer >= 0"),
+        (lambda: vsr.Search(stop_at=np.nan), "Search.stop_at: got nan, need a finite number"),
+        (lambda: vsr.Search(patience=0), "Search.patience: got 0, need an integer >= 1"),
     ],
 )
-def test_objectives_and_constraints_refuse_what_makes_no_sense(unchecked, make, message):
+def test_invalid_settings_are_rejected(unchecked, make, message):
     with pytest.raises(ValueError, match=message):
         make()
 
 
-def test_arms_are_solved_side_by_side(scene):
-    arms = posed(scene, FREE, Tension(1.0), SETS, (), {}, MODEL)[1].arms({}, {})
+def test_a_design_prints_its_numbers_with_units(found):
+    text = str(found)
+    assert text == repr(found)
+    assert text.startswith("objective  ")
+    assert "after 600 steps of 4 starts" in text
+    assert "actuators[0].routing.angle = 1.47 [rad]" in text
+    assert "Inside(wall=0.0005): satisfied, margin 0." in text
+    assert "inputs" not in text
+    shapes = []
+    eqx.filter_eval_shape(
+        lambda scene: shapes.append(str(found._replace(scene=scene))), found.scene
+    )
+    assert "routing.angle = " in shapes[0]
+
+
+def test_arms_have_one_equilibrium_per_set(scene):
+    arms = formulate(scene, FREE, Tension(1.0), SETS, (), {}, MODEL)[1].arms({}, {})
     assert isinstance(arms, Arms)
     assert arms.each(lambda eq: eq.tip).shape == (4, 4, 4)

@@ -1,4 +1,4 @@
-"""What an effect costs: the ladder of scenes and the clock."""
+"""Cost of each effect: the ladder of scenes, and timing."""
 
 import itertools
 
@@ -33,7 +33,7 @@ def test_every_rung_adds_one_effect():
     assert [rung.pose for rung in rungs] == [False] + [True] * 7
 
 
-def test_timed_counts_and_clocks():
+def test_timed_measures_operations_and_times():
     job = Timed(lambda x: x @ x, jnp.ones((8, 8)), calls=2)
     np.testing.assert_array_equal(job.output, 8.0)
     assert job.operations is None or 900 <= job.operations <= 1100  # 2 * 8^3
@@ -62,15 +62,15 @@ def test_table_compares_each_row_with_the_one_above():
     )
 
 
-def test_command_refuses_an_empty_batch(capsys):
+def test_command_rejects_an_empty_batch(capsys):
     with pytest.raises(SystemExit) as refusal:
         cli.main(["effects", "--batch-size", "0"])
     assert refusal.value.code == cli.BAD_USAGE
-    assert "--batch-size: got 0, need a whole number >= 1" in capsys.readouterr().err
+    assert "--batch-size: got 0, need an integer >= 1" in capsys.readouterr().err
 
 
 @pytest.mark.slow
-def test_ladder_is_climbed():
+def test_all_rungs_are_measured():
     costs = effects.measure(batch_size=4, rounds=1, model=vsr.StrainDependent(4))
     assert all(cost.converged == 1 for cost in costs)
     operations = [cost.operations for cost in costs]

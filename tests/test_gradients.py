@@ -217,9 +217,7 @@ def test_a_design_of_a_modulus_under_friction_runs():
         objective,
         inputs,
         model=STEPS,
-        starts=2,
-        candidates=2,
-        steps=3,
+        search=vsr.Search(starts=2, candidates=2, steps=3),
         progress=False,
     )
     assert 5e5 < float(found.scene.rod.material.young.value) < 1e6

@@ -1,5 +1,4 @@
-"""Health reports: distances to failure that are known in closed form, conditioning, and what is
-said in words."""
+"""Health reports: distances to failure known in closed form, conditioning, text of the report."""
 
 import json
 import math
@@ -25,7 +24,7 @@ def rod(density=None):
 
 @pytest.fixture(scope="module")
 def twins():
-    """Two threads in one place."""
+    """Two coincident threads."""
     return vsr.check(
         vsr.Scene(rod(), [vsr.Tendon(vsr.Parallel(0.0, 0.008))] * 2),
         jnp.array([1.0, 1.0]),
@@ -35,7 +34,7 @@ def twins():
 
 @pytest.fixture(scope="module")
 def strut():
-    """A strut of half of Euler's load, with a thread on its axis."""
+    """A strut under half of Euler's load, with a thread on its axis."""
     load = vsr.TipWrench(force=(-0.5 * math.pi**2 / 4 * BENDING / LENGTH**2, 0.0, 0.0))
     return vsr.check(
         vsr.Scene(rod(), [vsr.Tendon(vsr.Parallel(0.0, 0.0))], [load]),
@@ -44,7 +43,7 @@ def strut():
     )
 
 
-def test_tensions_may_grow_until_the_path_is_used_up(twins):
+def test_tensions_may_grow_until_the_path_has_no_length(twins):
     limit = 1 / (1 / AXIAL + 0.008**2 / BENDING) / 2
     np.testing.assert_allclose(twins.inputs.factor, limit, rtol=1e-3)
     assert twins.inputs.status == vsr.Status.COLLAPSED
@@ -71,8 +70,8 @@ def test_twin_threads_are_not_independent(twins):
     assert report.health_lines(health)[-1] == "  advice       all is well"
 
 
-def test_a_strut_may_bear_eulers_load(strut):
-    # the rod shortens and shears before it buckles: the load is Euler's within its own strain
+def test_a_strut_fails_at_eulers_load(strut):
+    # the rod shortens and shears before it buckles, so Euler's load is exact only to its strain
     np.testing.assert_allclose(strut.loads.factor, 2.0, rtol=5e-3)
     assert strut.loads.status == vsr.Status.UNSTABLE
     assert strut.inputs.status == vsr.Status.CONVERGED
@@ -85,7 +84,7 @@ def test_no_finer_steps_are_needed_for_an_arc(twins):
     assert twins.equilibrium.converged
 
 
-def test_it_goes_through_jit(twins):
+def test_it_runs_under_jit(twins):
     again = eqx.filter_jit(lambda scene, inputs: vsr.check(scene, inputs, model=MODEL))(
         twins.equilibrium.scene, twins.equilibrium.inputs
     )

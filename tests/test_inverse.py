@@ -1,4 +1,4 @@
-"""Inverse statics: targets that were reached by known inputs, and some that cannot be reached."""
+"""Inverse statics: targets with known inputs, and targets out of reach."""
 
 import json
 import re
@@ -25,8 +25,7 @@ def scene():
 
 @pytest.fixture(scope="module")
 def reached(scene):
-    """Inputs drawn, their tips with one more that is out of reach by 20 um and one by far, and what
-    is found for these."""
+    """Random inputs; targets: their tips, one out of reach by 20 um, one by far; results."""
     drawn = jnp.asarray(np.random.default_rng(3).uniform(0.2, MOST, (7, 3)))
     tips = jax.vmap(lambda u: vsr.solve(scene, u, model=MODEL).tip[:3, 3])(drawn)
     targets = jnp.concatenate([tips, jnp.array([[0.75 + 2e-5, 0.0, 0.0], [2.0, 0.0, 0.0]])])
@@ -37,26 +36,40 @@ def reached(scene):
     )
 
 
-def test_all_that_can_be_reached_are_and_the_inputs_are_found_again(scene, reached):
+def test_known_inputs_are_recovered(scene, reached):
     drawn, targets, found = reached
     assert np.all(found.reached[:7])
     assert np.all(found.miss[:7] < 1e-9)
     np.testing.assert_allclose(
         found.inputs[:7], drawn, atol=1e-8
-    )  # three tendons and three coordinates: there is one way only
+    )  # three tendons and three coordinates: the solution is unique
     alone = vsr.solve(scene, found.inputs[2], model=MODEL)
     np.testing.assert_allclose(alone.tip[:3, 3], targets[2], atol=1e-9)
 
 
-def test_what_is_out_of_reach_gets_the_nearest_point_and_says_so(reached):
+def test_a_target_out_of_reach_gives_the_nearest_point(reached):
     _, _, found = reached
     assert not found.reached[-1]
-    assert float(found.miss[-1]) == pytest.approx(1.25, abs=1e-6)  # the straight arm, at rest
+    assert float(found.miss[-1]) == pytest.approx(1.25, abs=1e-6)  # the straight arm at rest
     np.testing.assert_array_equal(found.inputs[-1], 0)
     assert np.all(found.equilibrium.converged)
 
 
-def test_what_is_missed_by_less_than_is_allowed_is_reached(reached):
+def test_a_result_prints_what_the_command_prints(reached, scene):
+    found = reached[-1]
+    one = jax.tree.map(lambda x: x[0], found)
+    lines = str(one).splitlines()
+    assert repr(one) == str(one)
+    assert lines[0].startswith("inputs     ")
+    assert lines[1].endswith("m, within the 7.5e-05 m allowed")
+    assert str(found).startswith("8 of 9 targets reached, largest miss 1.2 m")
+    texts = []
+    shapes = jax.eval_shape(lambda x: texts.append(str(x)) or x, one)
+    assert texts[0].startswith("Reach(inputs=")
+    assert str(shapes).startswith("Reach(inputs=")
+
+
+def test_a_miss_below_the_allowed_one_counts_as_reached(reached):
     _, _, found = reached
     np.testing.assert_allclose(found.miss[7], 2e-5, rtol=1e-6)
     assert found.reached[7]
@@ -90,8 +103,8 @@ def test_a_pose_and_points_along_the_arm(scene):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("place", [(0.0, 4.0, 7.0, 2.0), (3.0, 6.0, 3.0, 5.0)])
-def test_derivatives_by_the_target_are_those_of_differences(place):
-    """Four tendons for three coordinates: one is at its bound, or the effort chooses."""
+def test_derivatives_with_respect_to_the_target_against_differences(place):
+    """Four tendons for three coordinates: one is at its bound, or the effort decides."""
     arm = vsr.Rod(0.75, vsr.Circular(vsr.Taper(0.012, 0.010)), vsr.Material(5.93e5, shear=2e5))
     ring = [
         vsr.Tendon(vsr.Parallel(y, z))
@@ -158,19 +171,19 @@ def test_derivatives_by_the_target_are_those_of_differences(place):
         (np.diag([1.0, 1.0, -1.0, 1.0]), (0.0, 1.0), {}, r"target: got a reflection"),
     ],
 )
-def test_refusals(unchecked, scene, target, bounds, options, message):
+def test_invalid_arguments_are_rejected(unchecked, scene, target, bounds, options, message):
     with pytest.raises(ValueError, match=message):
         vsr.reach(scene, target, bounds, **options)
 
 
-def test_no_actuators_are_refused(unchecked, scene):
+def test_a_scene_without_actuators_is_rejected(unchecked, scene):
     with pytest.raises(ValueError, match="scene: got no actuators"):
         vsr.reach(vsr.Scene(scene.rod, []), [0.5, 0.0, 0.0], (0.0, 1.0))
 
 
 @pytest.mark.slow
-def test_six_digits_of_a_tip_are_reached_and_the_nearest_is_as_exact_as_ever(scene):
-    """One tendon, whose tips lie on a line in space: the target that was rounded is beside it."""
+def test_a_rounded_target_is_reached_and_the_nearest_point_is_exact(scene):
+    """The tips of one tendon form a curve in space; a target rounded to six digits is off it."""
     one = vsr.Scene(scene.rod, scene.actuators[:1])
     tip = vsr.solve(one, [7.0], model=MODEL).tip[:3, 3]
     rounded = jnp.asarray([float(f"{x:.6g}") for x in tip]) + jnp.array([0.0, 0.0, 2e-6])
@@ -185,7 +198,7 @@ def test_six_digits_of_a_tip_are_reached_and_the_nearest_is_as_exact_as_ever(sce
 
 
 @pytest.mark.slow
-def test_points_beyond_the_arm_are_missed_where_they_are_traced(scene):
+def test_traced_points_beyond_the_arm_are_not_reached(scene):
     one = vsr.Scene(scene.rod, scene.actuators[:1])
     target = vsr.solve(one, [7.0], model=MODEL).position([0.4])
     found = jax.jit(jax.vmap(lambda X: vsr.reach(one, target, (0.0, MOST), X=X, model=MODEL)))(
@@ -237,7 +250,7 @@ def test_the_command(tmp_path, capsys, monkeypatch, scene, close):
     verdict = (
         "0.0002 m, within the"
         if close
-        else "0.3 m, out of reach, this is the nearest found: more than the"
+        else "0.3 m, out of reach, this is the nearest point found: more than the"
     )
     assert f"  miss       {verdict} 0.001 m allowed\n" in text
     saved = json.loads(out.read_text())
@@ -245,8 +258,8 @@ def test_the_command(tmp_path, capsys, monkeypatch, scene, close):
 
 
 @pytest.mark.slow
-def test_the_command_reaches_the_six_digits_that_it_printed(tmp_path, capsys, scene):
-    """Two tendons for a tip in space: no inputs meet rounded digits exactly."""
+def test_the_command_reaches_a_tip_that_it_printed(tmp_path, capsys, scene):
+    """Two tendons for a tip in space: no inputs reach the rounded position exactly."""
     file = tmp_path / "arm.toml"
     vsr.save(vsr.Scene(scene.rod, scene.actuators[:2]), file, [7.0, 2.0])
     assert cli.main(["solve", str(file), "--steps", "8"]) == cli_common.DONE

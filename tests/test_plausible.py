@@ -1,4 +1,4 @@
-"""Warnings of implausible numbers: what they name and guess, and that ordinary arms have none."""
+"""Warnings about implausible numbers: names, guessed units, none for ordinary arms."""
 
 import pathlib
 
@@ -8,9 +8,10 @@ import pytest
 
 import vsr_jax as vsr
 from vsr_jax.analysis import plausible
+from vsr_jax.analysis.health import Limit
 from vsr_jax.cli import common as cli_common, main as cli, report
 from vsr_jax.files.scene_file import load
-from vsr_jax.optimization import design_search as optimize
+from vsr_jax.optimization import design_search
 from vsr_jax.studies import paper
 
 FOLDER = pathlib.Path(__file__).parents[1] / "notebooks"
@@ -78,7 +79,7 @@ def arm(
     ],
     ids=lambda value: " ".join(value) if isinstance(value, dict) else "",
 )
-def test_a_slip_of_unit_is_named(numbers, sentence):
+def test_a_wrong_unit_is_named(numbers, sentence):
     found = plausible.warnings_of(arm(**numbers))
     assert len(found) == 1
     assert found[0].startswith(sentence)
@@ -126,7 +127,7 @@ def test_large_strains_are_named_and_failed_or_traced_solves_are_not(helix):
 
 def test_the_health_of_a_solve_has_the_warnings(helix):
     eq = vsr.solve(arm(length=400.0), [0.0], model=vsr.StrainDependent(4))
-    limit = vsr.health.Limit(jnp.array(2.0), jnp.array(0))
+    limit = Limit(jnp.array(2.0), jnp.array(0))
     health = vsr.Health(eq, None, limit, None, jnp.array(0.0))
     (sentence,) = health.warnings
     assert f"  warning      {sentence}" in report.health_lines(health)
@@ -138,7 +139,7 @@ def test_the_health_of_a_solve_has_the_warnings(helix):
     [["solve"], ["check"], ["sweep"], ["reach", "--target", "0.1", "0", "0"]],
     ids=lambda x: x[0],
 )
-def test_commands_warn_on_stderr_before_they_begin(arguments, tmp_path, capsys):
+def test_commands_warn_on_stderr_before_solving(arguments, tmp_path, capsys):
     path = tmp_path / "arm.toml"
     path.write_text(HELIX.replace("length = 0.75", "length = 400"))
     name, *more = arguments
@@ -152,11 +153,11 @@ def test_commands_warn_on_stderr_before_they_begin(arguments, tmp_path, capsys):
     assert out == ""
 
 
-def test_design_warns_on_stderr_before_it_begins(tmp_path, capsys, monkeypatch):
+def test_design_warns_on_stderr_before_solving(tmp_path, capsys, monkeypatch):
     def design(*_, **__):
         raise ValueError("not now")
 
-    monkeypatch.setattr(optimize, "design", design)
+    monkeypatch.setattr(design_search, "design", design)
     path = tmp_path / "problem.toml"
     text = (FOLDER / "problems" / "reach_out.toml").read_text()
     path.write_text(text.replace("young = 8e5", "young = 0.8"))

@@ -1,5 +1,5 @@
-"""Pictures of designs, films, what is drawn onto arms; problems of design as files and the command
-that reads them."""
+"""Figures of designs, animations, annotations of arms; design files and the command that reads
+them."""
 
 import json
 
@@ -19,6 +19,8 @@ MODEL = vsr.StrainDependent(6)
 PROBLEM = """
 title = "A thread to one place"
 inputs = [[2.0]]
+
+[search]
 steps = 4
 starts = 2
 candidates = 2
@@ -77,23 +79,23 @@ def closed():
 
 
 def arrows(ax):
-    """Number of lines of every bundle of arrows in 3D axes."""
+    """Number of lines in each group of arrows in 3D axes."""
     return [len(bundle._segments3d) for bundle in ax.collections if hasattr(bundle, "_segments3d")]
 
 
 def test_frames_and_loads_are_drawn_onto_an_arm(eq):
     ax = annotate.frames(eq, plot.arm(eq), stations=5)
-    assert arrows(ax) == [15, 15, 15]  # a shaft and two lines of a head each
+    assert arrows(ax) == [15, 15, 15]  # one shaft and two lines of the head per arrow
     loaded = annotate.loads(eq)
-    assert len(loaded.collections) == 2  # twelve arrows of weight, one at the tip
-    assert loaded.zz_dataLim.x0 < -0.26  # all of them in the picture, with their ends
+    assert len(loaded.collections) == 2  # twelve arrows of the weight, one at the tip
+    assert loaded.zz_dataLim.x0 < -0.26  # the limits include all arrow heads
     assert loaded.zz_dataLim.x1 > -0.001
     weight, tip = annotate._forces(eq, 0.3)
     np.testing.assert_allclose(weight[1], [[0, 0, -9.81 * 1000 * np.pi * 1e-4]] * 12, rtol=1e-6)
     np.testing.assert_allclose(tip[1][0], 0.02 * np.asarray(eq.tip)[:3, 2], rtol=1e-6)
 
 
-def test_an_ellipsoid_has_the_size_it_says():
+def test_an_ellipsoid_has_its_semi_axes():
     ax = annotate.ellipsoid(
         vsr.Ellipsoid(jnp.array([1.0, 0.0, 0.0]), jnp.diag(jnp.array([0.5, 0.2, 0.1]))), scale=2.0
     )
@@ -111,8 +113,8 @@ def test_a_film_has_a_frame_for_each_arm(eq, tmp_path):
         film([eq, eq], titles=["a"])
 
 
-def test_a_problem_file_is_designed_kept_and_drawn(problem, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(cli_design, "hasten", lambda optimise: None)
+def test_the_command_designs_saves_and_draws(problem, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(cli_design, "reduce_compile_time", lambda optimise: None)
     out, record, picture = (
         tmp_path / name for name in ("designed.toml", "design.json", "design.png")
     )
@@ -121,7 +123,7 @@ def test_a_problem_file_is_designed_kept_and_drawn(problem, tmp_path, capsys, mo
     )
     said = capsys.readouterr().out
     assert code == 0
-    assert "Inside(wall=0.001): kept" in said
+    assert "Inside(wall=0.001): satisfied" in said
     assert "actuators[0].routing.y = " in said
     kept, told = load(out), json.loads(record.read_text())
     assert float(kept.scene.actuators[0].routing.y) == pytest.approx(
@@ -133,13 +135,12 @@ def test_a_problem_file_is_designed_kept_and_drawn(problem, tmp_path, capsys, mo
     assert picture.stat().st_size > 10_000
 
 
-def test_a_history_marks_the_one_that_was_chosen(problem):
-    task = load_design(problem)
-    found = vsr.design(
-        task.scene, task.free, task.objective, task.inputs, progress=False, **task.settings
-    )
+def test_a_history_marks_the_best_start(problem):
+    arguments = load_design(problem)._asdict()
+    del arguments["title"]
+    found = vsr.design(**arguments, progress=False)
     lines = plot_design.history(found).get_lines()
-    assert [line.get_label() for line in lines][-1] == "chosen"
+    assert [line.get_label() for line in lines][-1] == "best start"
     assert np.nanmin(lines[-1].get_ydata()) == pytest.approx(found.objective)
 
 
@@ -156,15 +157,18 @@ def test_a_history_marks_the_one_that_was_chosen(problem):
         ("wall = 0.001", "wall = -1.0", r"constraints\[0\]: Inside.wall: got -1"),
         ("young = 8e5", "young = -8e5", "young"),
         ("inputs = [[2.0]]", "", "missing key 'inputs'"),
+        ("steps = 4", "step = 4", r"search: unknown key 'step'.*did you mean 'steps'"),
+        ("steps = 4", "steps = 0", r"search: Search.steps: got 0, need an integer >= 1"),
+        ("steps = 4", "optimizer = 1", r"search: got .*, need a table of numbers"),
     ],
 )
-def test_errors_of_problem_files_name_file_and_place(unchecked, problem, old, new, message):
+def test_errors_of_design_files_name_file_and_key(unchecked, problem, old, new, message):
     problem.write_text(PROBLEM.replace(old, new, 1))
     with pytest.raises(ValueError, match=rf"problem.toml: .*{message}"):
         load_design(problem)
 
 
-def test_what_the_command_refuses_is_one_line(problem, capsys):
+def test_errors_of_the_command_are_one_line(problem, capsys):
     problem.write_text(PROBLEM.replace("[0.001, 0.009]", "[0.009, 0.001]"))
     assert cli.main(["design", str(problem)]) == 2
     assert capsys.readouterr().err.startswith(

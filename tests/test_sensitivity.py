@@ -1,5 +1,5 @@
-"""How a tip moves with numbers, inputs and wrenches: against differences of other solves, and beams
-that are known."""
+"""Derivatives of the tip with respect to numbers, inputs and wrenches: against finite differences
+and exact solutions of beams."""
 
 import equinox as eqx
 import jax
@@ -37,7 +37,7 @@ def tip_of():
 
 
 def motion(ahead, behind, step):
-    """Turn and displacement by a number, from poses a step to both sides of it."""
+    """Rotation and displacement per unit, by central differences of poses."""
     turn = (
         (ahead[:3, :3] - behind[:3, :3]) / (2 * step) @ (0.5 * (ahead[:3, :3] + behind[:3, :3])).T
     )
@@ -56,7 +56,7 @@ def motion(ahead, behind, step):
         "actuators[1].routing.z",
     ],
 )
-def test_rows_are_differences_of_finer_solves(eq, table, tip_of, name):
+def test_rows_against_differences_of_finer_solves(eq, table, tip_of, name):
     value = float(vsr.parameters(eq.scene)[name].value)
     step = 1e-5 * abs(value)
     ahead, behind = (
@@ -69,7 +69,7 @@ def test_rows_are_differences_of_finer_solves(eq, table, tip_of, name):
     np.testing.assert_allclose(row.turn, turn, atol=2e-6 * np.linalg.norm(turn))
 
 
-def test_inputs_are_rows_too_and_the_jacobian_has_them(eq, table, tip_of):
+def test_rows_of_the_inputs_are_the_jacobian(eq, table, tip_of):
     J = vsr.tip_jacobian(eq)
     for i in range(3):
         step = np.eye(3)[i] * 1e-4
@@ -81,7 +81,7 @@ def test_inputs_are_rows_too_and_the_jacobian_has_them(eq, table, tip_of):
     assert table["inputs[0]"].unit == "N"
 
 
-def test_the_table_reads_well(table):
+def test_the_printed_table(table):
     text = str(table)
     assert "actuators[2].routing.y[1]" in text
     assert len(text.splitlines()) == 2 + len(table.names)
@@ -89,9 +89,9 @@ def test_the_table_reads_well(table):
         table["rod.lenght"]
 
 
-def test_compliance_of_a_straight_beam_is_the_textbooks():
-    """Timoshenko's cantilever: L^3 / 3EI + L / kGA across, L / EA along, L / GJ in torsion, L^2 /
-    2EI between."""
+def test_compliance_of_a_straight_beam_is_exact():
+    """Timoshenko cantilever: L^3 / 3EI + L / kGA in bending, L / EA in tension, L / GJ in torsion,
+    L^2 / 2EI coupling."""
     arm = vsr.Rod(LENGTH, vsr.Circular(0.01), vsr.Material(8e5, shear=3e5))
     scene = vsr.Scene(arm, [vsr.Thread(vsr.Parallel(0.0, 0.0))])
     C = np.asarray(vsr.compliance(vsr.solve(scene, jnp.zeros(1), model=MODEL)))
@@ -106,9 +106,8 @@ def test_compliance_of_a_straight_beam_is_the_textbooks():
     np.testing.assert_allclose(C, expected, atol=1e-12 * np.abs(expected).max())
 
 
-def test_compliance_is_what_a_small_wrench_does(eq):
-    """The quadrature along a bent arm against solves under a wrench, which take another way
-    altogether."""
+def test_compliance_against_differences_of_solves(eq):
+    """The quadrature along a bent arm against solves under a wrench, an independent algorithm."""
     C = vsr.compliance(eq)
     pushed = jax.jit(
         lambda w: (
@@ -130,8 +129,7 @@ def test_compliance_is_what_a_small_wrench_does(eq):
 
 
 class Approximate(SteppedModel):
-    """A model of somebody else's, of which nothing is known but what models have to have: strains
-    in one wave each."""
+    """A third-party model with only the required methods: constant strains."""
 
     steps: int = eqx.field(static=True, default=8)
     order: int = eqx.field(static=True, default=4)
@@ -155,9 +153,8 @@ class Approximate(SteppedModel):
         return self.inner.node_strain(scene, state)
 
 
-def test_compliance_of_a_model_that_says_nothing_is_the_derivative_of_its_solve(eq):
-    """The balance of its sections does not hold, so the integral of their compliances is another
-    matrix."""
+def test_compliance_of_a_third_party_model_is_the_derivative_of_its_solve(eq):
+    """Its sections are not balanced, so the integral of their compliances is a different matrix."""
     found = vsr.solve(eq.scene, eq.inputs, model=Approximate())
     C, balanced = vsr.compliance(found), vsr.compliance(eq)
     pushed = jax.jit(
@@ -216,7 +213,7 @@ def test_under_vmap_jit_and_grad_and_in_single_precision(eq):
     assert rows.place.shape == (2, len(rows.names), 3)
 
 
-def test_a_failed_solve_has_none(eq):
+def test_a_failed_solve_gives_nan(eq):
     failed = vsr.solve(eq.scene, jnp.array([1e6, 0.0, 0.0]), model=MODEL)
     assert np.all(np.isnan(vsr.tip_jacobian(failed)))
     assert np.all(np.isnan(vsr.compliance(failed)))

@@ -75,6 +75,7 @@ from .solution import Energy, Equilibrium, Error, Plan, SolveError, Summary, pla
 if TYPE_CHECKING:
     from .models.continuum import Continuum
     from .optimization.design_search import Design, design
+    from .optimization.search import Search
     from .viz import annotate, plot, plot_design
     from .viz.animation import film
 
@@ -121,6 +122,7 @@ __all__ = [
     "Rod",
     "Scene",
     "SceneFile",
+    "Search",
     "Sensitivity",
     "SolveError",
     "Spline",
@@ -166,6 +168,7 @@ __all__ = [
 _LATER = {
     "Continuum": "models.continuum",
     "Design": "optimization.design_search",
+    "Search": "optimization.search",
     "annotate": "viz.annotate",
     "design": "optimization.design_search",
     "film": "viz.animation",

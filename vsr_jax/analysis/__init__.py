@@ -1,7 +1,7 @@
 """Results that need many solves: derivatives, inverse statics, health, branches of equilibria,
 sweeps.
 
-Must not know optimisers or pictures.
+Does not import optimizers or plotting.
 """
 
 from .branches import Branch, follow_branch

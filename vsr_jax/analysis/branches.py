@@ -1,23 +1,25 @@
-r"""Branches of equilibria, followed by their arc length: through limit points, stable or not.
+r"""Pseudo-arclength continuation of branches of equilibria, through limit points, stable or not.
+
+$r(y, s) = 0, \quad t \cdot (y - y_0, s - s_0) = h$
 
 With $y$ the unknowns of an arm and $s$ the parameter of a path of scenes and inputs, the equilibria
-$r(y, s) = 0$ are a curve. From a point on it with the unit tangent $t$ the next is where the curve
-meets the plane at the distance $h$ along $t$,
+$r(y, s) = 0$ form a curve. From the point $(y_0, s_0)$ with unit tangent $t$, Newton's method finds
+the intersection of the curve with the plane at distance $h$ along $t$. Its matrix stays regular
+where $\partial r / \partial y$ is singular.
 
-$$r(y, s) = 0, \quad t \cdot (y - y_0, s - s_0) = h,$$
-
-by Newton's method, whose matrix stays regular where $\partial r / \partial y$ alone is singular
-(Keller's pseudo-arclength, 1977).
+**Source:** H. B. Keller, Numerical solution of bifurcation and nonlinear eigenvalue problems
+(1977).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..arm.scene import Scene
@@ -39,19 +41,27 @@ from ..typing import Scalar, cast
 from ..validation import count, instance, numbers
 
 _MOST_CORRECTIONS = 8
+"""Newton corrections per step; a step that needs more is cut, since it began too far from the
+curve."""
 _FEW_CORRECTIONS = 3
+"""Corrections up to which the next step is doubled: quadratic convergence from a good start."""
 _MOST_CUTS = 12
+"""Halvings after which the branch counts as lost, at 1 / 4096 of the step."""
 _LEAST_COSINE = 0.9
-"""How far the tangents of neighbours may differ; a step that turns more is cut, so that it lands on
-no other branch."""
+"""Least cosine between successive tangents; a step that turns more is cut, so that it does not jump
+to another branch."""
+
+SceneOrPath = Scene | Callable[[Scalar], Scene]
+InputPath = Callable[[Scalar], ArrayLike | Sequence]
 
 
 class Branch(eqx.Module):
-    """Equilibria along a path, in the order in which they were met.
+    """Equilibria along a path, in the order of the arc length.
 
     **Fields:** `parameter` s of each, shape (points,); `equilibria`, an `Equilibrium` with a batch
-    axis of that size: ask it under `jax.vmap`, as in `jax.vmap(lambda eq:
-    eq.tip)(branch.equilibria)`. Unstable ones are converged here; their `stability` is below 0.
+    axis of that size, for use with `jax.vmap`, as in `jax.vmap(lambda eq:
+    eq.tip)(branch.equilibria)`. Unstable equilibria count as converged here; their `stability` is
+    negative.
     """
 
     parameter: Float[Array, " points"]
@@ -59,9 +69,9 @@ class Branch(eqx.Module):
 
 
 class _Walk(NamedTuple):
-    """Where the walk along the curve is: the last point (unknowns and parameter in one vector), the
-    unit tangent there, the length of the next step and how often it was cut; all points so far, how
-    many, the corrections taken for each, and whether the end of the path is reached."""
+    """State of the continuation: the last point u (unknowns and parameter in one vector), the unit
+    tangent there, the length of the next step and how often it was cut; all points so far, their
+    number, the corrections of each, and whether the end of the path is reached."""
 
     u: Array
     tangent: Array
@@ -74,8 +84,8 @@ class _Walk(NamedTuple):
 
 
 def follow_branch(
-    scene: Scene | Callable[[Scalar], Scene],
-    path: Callable[[Scalar], Any],
+    scene: SceneOrPath,
+    path: InputPath,
     *,
     model: StrainDependent | None = None,
     points: int = 100,
@@ -85,33 +95,32 @@ def follow_branch(
     with the parameter s from 0 to 1.
 
     It starts at the equilibrium that `solve` finds at s = 0 and follows the curve by its arc length
-    $\sigma$, on which the whole path counts 1 and the bending of the arm its angle in radians (root
-    mean square along the arm). Where the curve turns back at a limit point s falls again. It ends
-    at s = 1, or where the curve comes back to s = 0; points that are left repeat the end.
-    Derivatives of the equilibria are those at fixed s, and grow without bound towards a limit
-    point.
+    $\sigma$, in which the whole path counts 1 and bending counts its angle in radians (root mean
+    square along the arm). At a limit point s reverses. The branch ends at s = 1, or where the curve
+    returns to s = 0; remaining points repeat the end. Derivatives of the equilibria are taken at
+    fixed s and are unbounded at a limit point.
 
     **Arguments:**
-    - `scene`: a `Scene`, or a function of s that gives one, for loads or dimensions that change
+    - `scene`: a `Scene`, or a function of s that returns one, for loads or dimensions that change
       along the path.
-    - `path`: function of s that gives the inputs.
+    - `path`: function of s that returns the inputs.
     - `model`: a `StrainDependent`, by default with 12 steps: each correction solves a dense system
       of all its unknowns.
-    - `points`: how many points at most. `branch.parameter[-1] < 1` means that they did not reach
+    - `points`: largest number of points. `branch.parameter[-1] < 1` means that they did not reach
       the end.
-    - `step`: longest arc between neighbours; steps are cut where the curve bends.
+    - `step`: largest arc length between points; steps are shortened where the curve bends.
 
-    **Returns:** a `Branch`. Points after one from which the curve could not be followed have the
-    status `BRANCH_LOST`; if there is no equilibrium at s = 0 all have the status of that solve.
+    **Returns:** a `Branch`. Points after the last one that could be found have the status
+    `BRANCH_LOST`; without an equilibrium at s = 0 all points have the status of that solve.
 
-    **Raises:** `ValueError` for another model, and what `solve` raises at s = 0.
+    **Raises:** `ValueError` for another model, and the errors of `solve` at s = 0.
     """
     model = StrainDependent(12) if model is None else model
     instance(
         "model",
         model,
         StrainDependent,
-        "a StrainDependent, the model whose branches can be followed",
+        "a StrainDependent, the only model whose branches can be followed",
     )
     count("points", points, least=2)
     numbers("step", step, positive=True)
@@ -119,25 +128,23 @@ def follow_branch(
     return _follow(scene, path, start, points, jnp.asarray(step, start.inputs.dtype))
 
 
-def _at(
-    scene: Scene | Callable[[Scalar], Scene], path: Callable[[Scalar], Any], s: Scalar
-) -> tuple[Scene, Array]:
-    """Scene and inputs at a place of the path."""
-    there = (
+def _at(scene: SceneOrPath, path: InputPath, s: Scalar) -> tuple[Scene, Array]:
+    """Scene and inputs at the parameter s."""
+    here = (
         scene
         if isinstance(scene, Scene)
-        else instance("scene", scene(s), Scene, "a Scene or a function that gives one")
+        else instance("scene", scene(s), Scene, "a Scene or a function that returns one")
     )
-    values = there.check_inputs(path(s))
-    return cast(there, values.dtype), values
+    values = here.check_inputs(path(s))
+    return cast(here, values.dtype), values
 
 
 class _System(NamedTuple):
-    """The balance as a function of one vector: the unknowns times `scale`, so that bending counts
-    in radians, and s."""
+    """The balance as a function of one vector u: the unknowns times `scale`, so that bending counts
+    in radians, then s."""
 
-    scene: Any
-    path: Any
+    scene: SceneOrPath
+    path: InputPath
     model: StrainDependent
     scale: Array
 
@@ -146,7 +153,7 @@ class _System(NamedTuple):
         return problem_of(scene, inputs, self.model.grid(scene))
 
     def unknown(self, u: Array, problem: Problem, kind: Kind) -> Unknown:
-        """The unknowns in their own form; locked strains have their rest value."""
+        """The unknowns as a structure; locked strains have their rest value."""
         shape, size = problem.grid.X.shape, problem.grid.X.size
         values = u[:-1] / self.scale
         strain = values[: len(kind.free) * size].reshape(-1, *shape)
@@ -156,7 +163,7 @@ class _System(NamedTuple):
         return Unknown(xi, tuple(tension), tuple(turning))
 
     def residual(self, u: Array) -> Array:
-        """Imbalance as the gradient of an energy without unit by `u`."""
+        """Gradient of a dimensionless energy with respect to the unknowns in `u`."""
         problem, kind = self.problem(u[-1])
         unknown = self.unknown(u, problem, kind)
         rows = imbalance_of(unknown, state_of(unknown, problem, kind), problem, kind)
@@ -166,8 +173,8 @@ class _System(NamedTuple):
         return flat / self.scale * jnp.sum(problem.grid.h) ** 2 / bending
 
 
-def _system(scene: Any, path: Any, start: Equilibrium) -> tuple[_System, Array]:
-    """The system and its vector at the start of the path."""
+def _system(scene: SceneOrPath, path: InputPath, start: Equilibrium) -> tuple[_System, Array]:
+    """The system, and its vector at the start of the path."""
     model = start.model
     assert isinstance(model, StrainDependent)
     problem, kind = problem_of(start.scene, start.inputs, model.grid(start.scene))
@@ -189,7 +196,9 @@ def _system(scene: Any, path: Any, start: Equilibrium) -> tuple[_System, Array]:
 
 
 @eqx.filter_jit
-def _follow(scene: Any, path: Any, start: Equilibrium, points: int, step: Array) -> Branch:
+def _follow(
+    scene: SceneOrPath, path: InputPath, start: Equilibrium, points: int, step: Array
+) -> Branch:
     system, u = _system(scene, path, start)
     zero = jnp.zeros((), jnp.int32)
     everywhere = jnp.broadcast_to(u, (points, u.size))
@@ -218,8 +227,8 @@ def _follow(scene: Any, path: Any, start: Equilibrium, points: int, step: Array)
 
 
 def _attempt(system: _System, longest: Array, walk: _Walk) -> _Walk:
-    """One step along the tangent, corrected, to the next point; a shorter step next time if it was
-    too long."""
+    """One step: a prediction along the tangent and its correction. If the step was too long, the
+    next attempt uses half of it."""
     first = walk.found == 0
     goal, row, length, over = _aim(walk, first)
     u, J, size, count = _corrected(system, goal, row)
@@ -246,8 +255,8 @@ def _attempt(system: _System, longest: Array, walk: _Walk) -> _Walk:
 
 
 def _aim(walk: _Walk, first: Array) -> tuple[Array, Array, Array, Array]:
-    """Where the next point is looked for, the normal of the plane it lies in, the step's length,
-    and whether it is the path's end.
+    """Prediction of the next point, normal of the plane it lies in, length of the step, and whether
+    it is the end of the path.
 
     The first point and the end of the path lie in planes of fixed s.
     """
@@ -258,22 +267,22 @@ def _aim(walk: _Walk, first: Array) -> tuple[Array, Array, Array, Array]:
 
 
 def _last_axis(u: Array) -> Array:
-    """Unit vector of the parameter's axis."""
+    """Unit vector along the axis of s."""
     return jnp.zeros_like(u).at[-1].set(1.0)
 
 
 def _small(u: Array) -> Array:
-    """A change of the unknowns whose square is rounding."""
+    """Size of a change of the unknowns whose square is below rounding error."""
     return jnp.asarray(jnp.finfo(u.dtype).eps ** 0.6, u.dtype)
 
 
 def _corrected(system: _System, goal: Array, row: Array) -> tuple[Array, Array, Array, Array]:
-    """Where the curve meets a plane, by Newton's method: the point, the matrix, the size of the
-    last change, the corrections."""
+    """Intersection of the curve with a plane, by Newton's method: the point, the matrix, the size
+    of the last change, the number of corrections."""
 
     def proceed(state: tuple) -> Array:
         _, _, size, count = state
-        return (size > _small(goal)) & (count < _MOST_CORRECTIONS)  # NaN ends it
+        return (size > _small(goal)) & (count < _MOST_CORRECTIONS)  # NaN ends the loop
 
     def correct(state: tuple) -> tuple:
         u, _, _, count = state
@@ -288,7 +297,7 @@ def _corrected(system: _System, goal: Array, row: Array) -> tuple[Array, Array, 
 
 
 def _equilibrium(system: _System, u: Array, status: Array, steps: Array) -> Equilibrium:
-    """The equilibrium at a point, with derivatives at fixed s."""
+    """Equilibrium at a point of the curve, with derivatives at fixed s."""
     s = u[-1]
 
     def solved(matvec: Callable, right: Array) -> Array:

@@ -1,7 +1,7 @@
-r"""How a tip moves: with every number of its scene, with its inputs, and with a wrench on it.
+r"""Derivatives of the tip pose with respect to the numbers of a scene, its inputs and a tip wrench.
 
-Small motions are those of the tip's section in the world's axes, $(\delta\theta, \delta r)$: the
-turn [rad], then the displacement [m]. All are implicit derivatives of the equilibrium.
+Small motions of the tip are $(\delta\theta, \delta r)$ in the world's axes: rotation [rad], then
+displacement [m]. All derivatives are implicit derivatives of the equilibrium.
 """
 
 from typing import NamedTuple
@@ -9,6 +9,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..arm.loads import TipWrench
@@ -21,9 +22,9 @@ from ..solution.solver import solve
 from ..typing import Pose
 
 
-class Row(NamedTuple):
-    """One number of a scene, and the tip's motion with it: turn [rad] and displacement [m] by its
-    unit."""
+class SensitivityRow(NamedTuple):
+    """One number of a scene, and the derivative of the tip with respect to it: rotation `turn`
+    [rad] and displacement `place` [m] per unit of the number."""
 
     value: Array
     unit: str
@@ -32,11 +33,11 @@ class Row(NamedTuple):
 
 
 class Sensitivity(eqx.Module):
-    """The tip's derivative by every number of a scene and by its inputs: `table["rod.length"]` is a
-    `Row`, `print(table)` all of them.
+    """Derivatives of the tip with respect to every number of a scene and its inputs.
+    `table["rod.length"]` is a `SensitivityRow`, `print(table)` prints all rows.
 
-    **Fields:** `names`, `units`; `values`, shape (numbers,); `turn` [rad] and `place` [m] by the
-    number's unit, shape (numbers, 3).
+    **Fields:** `names`, `units`; `values`, shape (numbers,); `turn` [rad] and `place` [m] per unit
+    of the number, shape (numbers, 3).
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -45,17 +46,17 @@ class Sensitivity(eqx.Module):
     turn: Float[Array, "numbers 3"]
     place: Float[Array, "numbers 3"]
 
-    def __getitem__(self, name: str) -> Row:
+    def __getitem__(self, name: str) -> SensitivityRow:
         i = self.names.index(name) if name in self.names else None
         if i is None:
             raise KeyError(f"{name!r}: known are {', '.join(self.names)}")
-        return Row(self.values[i], self.units[i], self.turn[i], self.place[i])
+        return SensitivityRow(self.values[i], self.units[i], self.turn[i], self.place[i])
 
     def __str__(self) -> str:
         width = max(map(len, self.names))
         lines = [
             f"{'number':{width}} {'value':>12}  {'unit':7} {'dx':>10} {'dy':>10} {'dz':>10}   mm "
-            f"by 1 %"
+            f"per 1 %"
         ]
         for name, unit, value, place in zip(
             self.names, self.units, self.values, self.place, strict=True
@@ -65,17 +66,16 @@ class Sensitivity(eqx.Module):
             lines.append(
                 f"{name:{width}} {float(value):12.6g}  {unit or '?':7} {steps} {share:11.3g}"
             )
-        return "\n".join([*lines, "dx, dy, dz: displacement of the tip [m] by the number's unit"])
+        return "\n".join([*lines, "dx, dy, dz: displacement of the tip [m] per unit of the number"])
 
 
 def sensitivity(eq: Equilibrium) -> Sensitivity:
-    r"""The tip's derivative by every number of the scene and by every input: $(\partial\theta,
-    \partial r) / \partial p$.
+    r"""Derivatives of the tip with respect to every number of the scene and every input,
+    $(\partial\theta, \partial r) / \partial p$.
 
-    **Arguments:** `eq`: a solved scene, one at a time; NaN where it failed.
+    **Arguments:** `eq`: one solved scene; the result is NaN where it failed.
 
-    **Returns:** a `Sensitivity`, a table by name with units. Arrays have a row for each of their
-    numbers.
+    **Returns:** a `Sensitivity`, a table by name with units. Arrays have one row per entry.
     """
     known = parameters(eq.scene)
     named = [entry for name, parameter in known.items() for entry in parameter.entries(name)]
@@ -102,7 +102,7 @@ def _by_numbers(eq: Equilibrium) -> tuple[Array, Array, Array]:
 
 
 def _motion(tip: Pose, here: Pose) -> Float[Array, "6"]:
-    """Turn and displacement from a pose nearby, to first order, in the world's axes."""
+    """Rotation and displacement from a nearby pose, to first order, in the world's axes."""
     turn = tip[:3, :3] @ jax.lax.stop_gradient(here)[:3, :3].T
     axis = 0.5 * jnp.stack(
         [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
@@ -111,12 +111,12 @@ def _motion(tip: Pose, here: Pose) -> Float[Array, "6"]:
 
 
 def tip_jacobian(eq: Equilibrium) -> Float[Array, "6 inputs"]:
-    r"""The tip's derivative by the inputs, $J = (\partial\theta, \partial r) / \partial u$, turn
-    first, in the world's axes.
+    r"""Derivative of the tip with respect to the inputs, $J = (\partial\theta, \partial r) /
+    \partial u$, in the world's axes.
 
-    **Arguments:** `eq`: a solved scene, one at a time; NaN where it failed.
+    **Arguments:** `eq`: one solved scene; the result is NaN where it failed.
 
-    **Returns:** shape (6, inputs) [rad and m by the actuators' units].
+    **Returns:** shape (6, inputs) [rad and m per unit of the input].
     """
     return _by_inputs(eq)
 
@@ -131,16 +131,16 @@ def _by_inputs(eq: Equilibrium) -> Array:
 
 
 def compliance(eq: Equilibrium) -> Float[Array, "6 6"]:
-    r"""What a small dead wrench on the tip moves it by: $(\delta\theta, \delta r) = C (\delta M,
-    \delta F)$, in the world's axes.
+    r"""Compliance matrix of the tip, $(\delta\theta, \delta r) = C (\delta M, \delta F)$, for a
+    small dead wrench on the tip, in the world's axes.
 
-    Without loads $C = \int G^T (\Sigma - A)^{-1} G \, dX$, where G carries the wrench to the
-    sections, for models that are `balanced_everywhere`. With loads, given lengths or friction, and
-    for all other models, the derivative of the solve with one more `TipWrench`.
+    Without loads, for models that are `balanced_everywhere`, $C = \int G^T (\Sigma - A)^{-1} G \,
+    dX$, where G transforms the wrench to the frames of the sections. With loads, given lengths or
+    friction, and for all other models, the derivative of the solve with an additional `TipWrench`.
 
-    **Arguments:** `eq`: a solved scene, one at a time; NaN where it failed.
+    **Arguments:** `eq`: one solved scene; the result is NaN where it failed.
 
-    **Returns:** shape (6, 6) [rad and m by N m and N]; symmetric where the loads have a potential.
+    **Returns:** shape (6, 6) [rad and m per N m and N]; symmetric if the loads have a potential.
     """
     return _compliance(eq)
 
@@ -165,14 +165,14 @@ def _compliance(eq: Equilibrium) -> Array:
 
 
 def _pushed(eq: Equilibrium, wrench: Float[Array, "6"]) -> Equilibrium:
-    """The arm with one more wrench on its tip."""
+    """The equilibrium with an additional wrench on the tip."""
     loads = (*eq.scene.loads, TipWrench(wrench[3:], wrench[:3]))
     scene = Scene(eq.scene.rod, eq.scene.actuators, loads, free_strains=eq.scene.free_strains)
     return solve(scene, eq.inputs, model=eq.model)
 
 
 def _carried(g: Pose, tip: Pose) -> Float[Array, "6 6"]:
-    """Wrench in a section's frame from one on the tip in the world's axes."""
+    """Matrix from a wrench on the tip, in the world's axes, to the wrench in a section's frame."""
     turned = g[:3, :3].T
     arm = tip[:3, 3] - g[:3, 3]
     moment = jnp.concatenate([turned, turned @ c.join_matrix(c.skew(c.split(arm)))], axis=1)
@@ -180,7 +180,7 @@ def _carried(g: Pose, tip: Pose) -> Float[Array, "6 6"]:
 
 
 class Ellipsoid(NamedTuple):
-    """An ellipsoid in space: `centre` [m] and half `axes`, the columns of a matrix, the longest
+    """An ellipsoid in space: `centre` [m] and semi-`axes`, the columns of a matrix, longest
     first."""
 
     centre: Float[Array, "3"]
@@ -188,25 +188,26 @@ class Ellipsoid(NamedTuple):
 
     @property
     def measure(self) -> Array:
-        """Product of the half axes; 0 where it is flat."""
+        """Product of the semi-axes; 0 for a flat ellipsoid."""
         return jnp.prod(c.norm(c.split(self.axes.T)))
 
 
 def ellipsoid(matrix: Float[Array, "3 columns"], centre: Float[Array, "3"]) -> Ellipsoid:
-    r"""Where $A x$ gets for $|x| \le 1$, about a centre."""
+    r"""The set $\{c + A x : |x| \le 1\}$ for a centre c."""
     U, lengths, _ = jnp.linalg.svd(matrix, full_matrices=True)
     lengths = jnp.zeros(3, lengths.dtype).at[: lengths.size].set(lengths)
     return Ellipsoid(centre, U * lengths)
 
 
-def manipulability(eq: Equilibrium, scale: float | Array = 1.0) -> Ellipsoid:
-    r"""Manipulability ellipsoid: displacements of the tip by changes of the inputs with $\sum_i
+def manipulability(eq: Equilibrium, scale: ArrayLike = 1.0) -> Ellipsoid:
+    r"""Manipulability ellipsoid: displacements of the tip for changes of the inputs with $\sum_i
     (\delta u_i / s_i)^2 \le 1$.
 
-    Its `measure` is Yoshikawa's, $\sqrt{\det J J^T}$ for $J$ scaled, 0 for fewer than three inputs.
+    Its `measure` is Yoshikawa's, $\sqrt{\det J J^T}$ of the scaled J, 0 for fewer than three
+    inputs.
 
-    **Arguments:** `eq`: a solved scene; `scale`: $s$, one number or one an actuator, in their
-    units.
+    **Arguments:** `eq`: a solved scene; `scale`: $s$, one number or one per actuator, in the units
+    of the inputs.
 
     **Source:** T. Yoshikawa, Manipulability of Robotic Mechanisms, Int. J. Robotics Research 4
     (1985).
@@ -214,6 +215,6 @@ def manipulability(eq: Equilibrium, scale: float | Array = 1.0) -> Ellipsoid:
     return ellipsoid(tip_jacobian(eq)[3:] * scale, eq.tip[:3, 3])
 
 
-def compliance_ellipsoid(eq: Equilibrium, force: float | Array = 1.0) -> Ellipsoid:
-    """Displacements of the tip by forces on it of at most `force` [N] in any direction."""
+def compliance_ellipsoid(eq: Equilibrium, force: ArrayLike = 1.0) -> Ellipsoid:
+    """Displacements of the tip for forces on it of at most `force` [N] in any direction."""
     return ellipsoid(compliance(eq)[3:, 3:] * force, eq.tip[:3, 3])

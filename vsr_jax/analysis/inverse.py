@@ -1,24 +1,23 @@
-r"""Inverse statics: the inputs that bring an arm's tip, or points along it, to where they are
-wanted.
+r"""Inverse statics: inputs that bring an arm's tip, or points along the arm, to target positions.
 
-With inputs $u = u_0 + (u_1 - u_0) s$ between their bounds, $0 \le s_i \le 1$, the shares s are
-found that make
+$\min_s \sum_j |x_j(s) - x_j^*|^2 / L^2 + w^2 \sum_i (s_i - s_{0i})^2, \quad
+u = u_0 + (u_1 - u_0) s, \quad 0 \le s_i \le 1$
 
-$$\sum_j |x_j(s) - x_j^*|^2 / L^2 + w^2 \sum_i (s_i - s_{0i})^2$$
-
-least for a weight w that falls to nothing, where $s_0$ is the share at which an input is nearest to
-nothing (see `box`). The second sum chooses the least effort among many solutions. The first start
-is the nearest of some inputs that are tried out beforehand; the next nearest follow where it does
-not lead to the target. Derivatives are those of the condition for the least sum.
+for a weight w that decreases to zero (`bounded_least_squares`). $s_0$ is the share at which an
+input is closest to zero, so the second sum selects the least effort among many solutions. The first
+start is the nearest of 512 random inputs; further starts follow if it does not reach the target.
+Derivatives are those of the optimality condition.
 """
 
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Bool, Float
 
 from ..arm.scene import Scene
@@ -29,26 +28,26 @@ from ..numerics.se3 import rotation_vector
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
 from ..typing import Scalar, cast
-from ..validation import instance, interval, numbers, on_arm, positive, rigid
+from ..validation import instance, interval, is_traced, numbers, on_arm, positive, rigid
 
-_TRIED, _STARTS = 512, 6
-_ENOUGH = {"float64": 1e-6, "float32": 1e-3}
-"""Miss, by the length, from which on no other start is tried: at one that is greater there may be a
-nearer place elsewhere."""
-_BESIDE = 0.1
-"""Distance, by the diagonal of the box of shares, within which inputs tried out lead to the same
-place."""
+_SAMPLES, _STARTS = 512, 6
+"""Random inputs, and the starts chosen among them."""
+_CLOSE_ENOUGH = {"float64": 1e-6, "float32": 1e-3}
+"""Miss, relative to the length, below which no further start is used."""
+_SAME_BASIN = 0.1
+"""Distance, relative to the diagonal of the box of shares, within which inputs are assumed to lead
+to the same minimum."""
 
 
 class Reach(NamedTuple):
-    """What `reach` found.
+    """Result of `reach`; `print` it for a summary.
 
-    - `inputs`: one number an actuator.
-    - `equilibrium`: the arm there.
-    - `miss` [m]: distance of the points from where they are wanted, the root of the sum of squares;
-      of a pose [m], with the angle [rad] times the arm's length.
-    - `reached`: whether that is at most `allowed_miss`. If not, this is the nearest found.
-    - `allowed_miss` [m]: miss that counts as reached.
+    - `inputs`: one number per actuator.
+    - `equilibrium`: the arm for these inputs.
+    - `miss` [m]: distance from the target; for several points the root of the sum of squares, for a
+      pose with the angle [rad] times the arm's length.
+    - `reached`: whether the miss is at most `allowed_miss`; if not, this is the nearest found.
+    - `allowed_miss` [m]: largest miss that counts as reached.
     """
 
     inputs: Float[Array, " inputs"]
@@ -57,53 +56,76 @@ class Reach(NamedTuple):
     reached: Bool[Array, ""]
     allowed_miss: Scalar
 
+    def __str__(self) -> str:
+        numbers = (self.inputs, self.miss, self.reached, self.allowed_miss)
+        if not all(eqx.is_array_like(x) and not is_traced(x) for x in numbers):
+            return f"Reach(inputs={self.inputs}, miss={self.miss})"
+        if self.inputs.ndim > 1:
+            worst = float(np.max(np.asarray(self.miss)))
+            reached = int(np.sum(np.asarray(self.reached)))
+            return f"{reached} of {self.reached.size} targets reached, largest miss {worst:.2g} m"
+        verdict = (
+            "within the"
+            if bool(self.reached)
+            else "out of reach, this is the nearest point found: more than the"
+        )
+        return (
+            f"inputs     {', '.join(f'{value:.6g}' for value in np.asarray(self.inputs))}\n"
+            f"miss       {float(self.miss):.2g} m, {verdict} {float(self.allowed_miss):.2g} m "
+            f"allowed"
+        )
+
+    __repr__ = __str__
+
 
 def reach(
     scene: Scene,
-    target: Any,
-    bounds: Any,
+    target: ArrayLike | Sequence,
+    bounds: Sequence[ArrayLike | Sequence],
     *,
-    X: Any = None,
+    X: ArrayLike | Sequence | None = None,
     model: Model | None = None,
     allowed_miss: float | None = None,
 ) -> Reach:
-    """Inputs within bounds that bring the arm to a target, with the least effort among those that
-    do.
+    """Inputs within bounds that bring the arm to a target, with the least effort among all that do.
 
-    One target at a time; batch with `jax.vmap`. Derivatives of the inputs by the target and by the
-    scene's numbers are implicit.
+    One target at a time; batch with `jax.vmap`. Derivatives of the inputs with respect to the
+    target and the scene's numbers are implicit.
 
     **Arguments:**
-    - `target`: place of the tip [m], shape (3,); its pose, a rigid transform of shape (4, 4); or
-      with `X` the places of points of the axis, shape (points, 3). Its dtype is the precision.
-    - `bounds`: the least and the greatest inputs, a pair of numbers or of arrays with one number an
+    - `target`: position of the tip [m], shape (3,); its pose, a rigid transform of shape (4, 4); or
+      with `X` the positions of points on the axis, shape (points, 3). Its dtype is the precision.
+    - `bounds`: least and greatest inputs, a pair of numbers or of arrays with one number per
       actuator.
     - `X`: abscissas [m] of the points on the arm, shape (points,).
     - `model`: as for `solve`.
-    - `allowed_miss` [m]: miss that counts as reached; a ten-thousandth of the length, in single
-      precision a thousandth. It decides on `reached` alone: the nearest is found as exactly with
-      any.
+    - `allowed_miss` [m]: largest miss that counts as reached; by default 1e-4 of the length, in
+      single precision 1e-3. It only affects `reached`; the inputs are those of the nearest point in
+      any case.
 
-    **Raises:** `ValueError` for shapes that do not fit, a pose that is no rigid transform, points
-    beyond the arm, bounds that contradict each other or an actuator's range, and no actuators.
+    **Returns:** a `Reach`.
+
+    **Raises:** `ValueError` for wrong shapes, a pose that is not a rigid transform, points beyond
+    the arm, bounds that contradict each other or an actuator's range, and a scene without
+    actuators.
     """
     instance("scene", scene, Scene, "a Scene")
-    wanted = numbers("target", target, None)
-    places = None if X is None else numbers("X", X, None).astype(wanted.dtype)
-    _check_target(wanted, places, scene)
-    low, high = _check_bounds(scene, bounds, wanted.dtype)
-    scene, model, places = cast((scene, model, places), wanted.dtype)
-    share = 1e-4 if wanted.dtype == jnp.float64 else 1e-3
+    aim = numbers("target", target, None)
+    stations = None if X is None else numbers("X", X, None).astype(aim.dtype)
+    _check_target(aim, stations, scene)
+    low, high = _check_bounds(scene, bounds, aim.dtype)
+    scene, model, stations = cast((scene, model, stations), aim.dtype)
+    share = 1e-4 if aim.dtype == jnp.float64 else 1e-3
     allowed = (
         share * scene.rod.length
         if allowed_miss is None
-        else jnp.asarray(positive("allowed_miss", allowed_miss), wanted.dtype)
+        else jnp.asarray(positive("allowed_miss", allowed_miss), aim.dtype)
     )
-    return _reach(_Task(scene, wanted, places, low, high, model), allowed)
+    return _reach(_ReachProblem(scene, aim, stations, low, high, model), allowed)
 
 
-class _Task(NamedTuple):
-    """What is to be reached: `X` is None for the tip."""
+class _ReachProblem(NamedTuple):
+    """Target, bounds and model; `X` is None for the tip."""
 
     scene: Scene
     target: Array
@@ -113,27 +135,27 @@ class _Task(NamedTuple):
     model: Model | None
 
     def inputs(self, share: Array) -> Array:
-        """Inputs at a share of the way between their bounds."""
+        """Inputs at shares of the range between their bounds."""
         return self.low + (self.high - self.low) * share
 
     @property
     def idle(self) -> Array:
-        """Share at which each input is nearest to nothing."""
+        """Share at which each input is closest to zero."""
         span = jnp.where(self.high > self.low, self.high - self.low, 1.0)
         return (jnp.clip(jnp.zeros_like(self.low), self.low, self.high) - self.low) / span
 
     def at(self, share: Array) -> Equilibrium:
-        """The arm at a share of the way between the bounds."""
+        """Equilibrium for inputs at shares of the range."""
         return solve(self.scene, self.inputs(share), model=self.model)
 
     def places(self, eq: Equilibrium) -> Array:
-        """Pose of the tip, its place, or those of the points."""
+        """What the target prescribes: pose of the tip, its position, or positions of the points."""
         if self.X is not None:
             return eq.position(self.X)
         return eq.tip if self.target.shape == (4, 4) else eq.tip[:3, 3]
 
     def misses(self, places: Array) -> Array:
-        """What is missed [m], in a row."""
+        """Differences from the target [m], shape (differences,)."""
         if self.target.shape != (4, 4):
             return (places - self.target).reshape(-1)
         turn = self.target[:3, :3].T @ places[:3, :3]
@@ -141,16 +163,16 @@ class _Task(NamedTuple):
             [places[:3, 3] - self.target[:3, 3], self.scene.rod.length * rotation_vector(turn)]
         )
 
-    def missed(self, share: Array) -> Array:
-        """What is missed at a share of the way, by the arm's length."""
+    def residual(self, share: Array) -> Array:
+        """Differences from the target relative to the arm's length, at shares of the range."""
         return self.misses(self.places(self.at(share))) / self.scene.rod.length
 
 
 def _check_target(target: Array, X: Array | None, scene: Scene) -> None:
     if X is None and target.shape not in ((3,), (4, 4)):
         raise ValueError(
-            f"target: got shape {target.shape}, need (3,), a place, or (4, 4), a pose, or with X "
-            f"(points, 3)"
+            f"target: got shape {target.shape}, need (3,), a position, or (4, 4), a pose, or with "
+            f"X (points, 3)"
         )
     if X is not None and (X.ndim != 1 or target.shape != (X.size, 3)):
         raise ValueError(
@@ -163,68 +185,69 @@ def _check_target(target: Array, X: Array | None, scene: Scene) -> None:
         on_arm("X", X, scene.rod.length)
 
 
-def _check_bounds(scene: Scene, bounds: Any, dtype: Any) -> tuple[Array, Array]:
+def _check_bounds(
+    scene: Scene, bounds: Sequence[ArrayLike | Sequence], dtype: DTypeLike
+) -> tuple[Array, Array]:
     size = len(scene.actuators)
     if not size:
-        raise ValueError("scene: got no actuators, need one at least")
+        raise ValueError("scene: got no actuators, need at least one")
     low, high = interval("bounds", bounds, size)
     scene.check_inputs(low)
     return low.astype(dtype), high.astype(dtype)
 
 
 @eqx.filter_jit
-def _reach(task: _Task, allowed: Scalar) -> Reach:
+def _reach(problem: _ReachProblem, allowed: Scalar) -> Reach:
     tried = jnp.asarray(
-        np.random.default_rng(0).uniform(size=(_TRIED, task.low.size)), task.low.dtype
+        np.random.default_rng(0).uniform(size=(_SAMPLES, problem.low.size)), problem.low.dtype
     )
-    tried = jnp.concatenate([task.idle[None], tried])
-    places = jax.vmap(lambda share: task.places(task.at(share)))(
+    tried = jnp.concatenate([problem.idle[None], tried])
+    places = jax.vmap(lambda share: problem.places(problem.at(share)))(
         tried
-    )  # of the scene alone: under vmap over targets these are solved once
-    distance = jax.vmap(lambda x: jnp.linalg.norm(task.misses(x)))(places)
-    still = _still(task)
-    enough = jnp.minimum(allowed / still.scene.rod.length, _ENOUGH[still.target.dtype.name])
+    )  # independent of the target: under vmap over targets solved once
+    distance = jax.vmap(lambda x: jnp.linalg.norm(problem.misses(x)))(places)
+    still = _still(problem)
+    enough = jnp.minimum(allowed / still.scene.rod.length, _CLOSE_ENOUGH[still.target.dtype.name])
     found = bounded_least_squares.nearest(
-        still.missed, lax.stop_gradient(_starts(tried, distance)), still.idle, enough
+        still.residual, lax.stop_gradient(_starts(tried, distance)), still.idle, enough
     )
-    share = _moving(task, found)
-    there = task.at(share)
-    miss = norm(split(task.misses(task.places(there))))
+    share = _moving(problem, found)
+    there = problem.at(share)
+    miss = norm(split(problem.misses(problem.places(there))))
     miss = jnp.where(jnp.isfinite(miss), miss, jnp.inf)
-    return Reach(task.inputs(share), there, miss, miss <= allowed, allowed)
+    return Reach(problem.inputs(share), there, miss, miss <= allowed, allowed)
 
 
 def _starts(
     tried: Float[Array, "tried inputs"], distance: Float[Array, " tried"]
 ) -> Float[Array, "starts inputs"]:
-    """The nearest, then the nearest of those that are not beside a start: the tip may pass by the
-    target more than once."""
+    """The nearest inputs, then repeatedly the nearest of those that are not close to a start
+    already chosen: there may be several minima."""
     distance, starts = jnp.where(jnp.isfinite(distance), distance, jnp.inf), []
     for _ in range(_STARTS):
         starts.append(tried[jnp.argmin(distance)])
-        beside = jnp.linalg.norm(tried - starts[-1], axis=1) < _BESIDE * tried.shape[1] ** 0.5
+        beside = jnp.linalg.norm(tried - starts[-1], axis=1) < _SAME_BASIN * tried.shape[1] ** 0.5
         distance = jnp.where(beside, jnp.inf, distance)
     return jnp.stack(starts)
 
 
-def _moving(task: _Task, found: bounded_least_squares.Nearest) -> Array:
-    """The share found, with its derivatives: those of where the slope of the sum with the last
-    weight is nothing."""
+def _moving(problem: _ReachProblem, found: bounded_least_squares.Nearest) -> Array:
+    """The shares found, with the derivatives of the stationary point for the last weight."""
 
     def half(share: Array) -> Array:
-        effort = bounded_least_squares.weight(share.dtype) * (share - task.idle)
-        return (jnp.sum(task.missed(share) ** 2) + jnp.sum(effort**2)) / 2
+        effort = bounded_least_squares.weight(share.dtype) * (share - problem.idle)
+        return (jnp.sum(problem.residual(share) ** 2) + jnp.sum(effort**2)) / 2
 
     def slope(share: Array) -> Array:
         return jnp.where(found.free, jax.grad(half)(share), share - found.regular)
 
-    def back(linear: Any, slope: Array) -> Array:
+    def back(linear: Callable[[Array], Array], slope: Array) -> Array:
         return jnp.linalg.solve(jax.jacobian(linear)(slope), slope)
 
     root = lax.custom_root(slope, found.regular, lambda _, share: share, back)
     return found.share + root - lax.stop_gradient(root)
 
 
-def _still(task: _Task) -> _Task:
-    arrays, rest = eqx.partition(task, eqx.is_inexact_array)
+def _still(problem: _ReachProblem) -> _ReachProblem:
+    arrays, rest = eqx.partition(problem, eqx.is_inexact_array)
     return eqx.combine(lax.stop_gradient(arrays), rest)

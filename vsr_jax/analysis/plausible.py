@@ -1,19 +1,18 @@
-r"""Warnings about numbers that are far outside of what arms have, most often by a slip of unit:
-millimetres for metres, MPa for Pa.
+r"""Warnings about implausible numbers, most often a wrong unit: millimetres for metres, MPa for Pa.
 
-What is looked at: length, half thickness b, slenderness L / b, moduli, density, bores of chambers
-and, of a solved arm, the largest strain $\max(b\,|k - k^*|, |u - u^*|)$, beyond which a linear
-material is doubtful. Nothing is refused here.
+Checked are length, half thickness b, slenderness L / b, moduli, density, chamber areas and, for a
+solved arm, the largest strain $\max(b\,|k - k^*|, |u - u^*|)$, above which a linear material is
+doubtful. No number is rejected here.
 """
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from ..arm.actuator import Chamber
 from ..arm.scene import Scene
@@ -21,26 +20,26 @@ from ..solution.equilibrium import Equilibrium
 from ..validation import is_traced
 
 LARGEST_STRAIN = 0.5
-"""Bending, twist, stretch and shear of soft silicone stay below it at working loads."""
+"""Strains of soft silicone stay below it at working loads."""
 
 _STATIONS = 17
+"""Stations along the arm: profiles are smooth, so few are enough for a warning."""
 
 
 class _Range(NamedTuple):
-    """What arms have, least and most; and by what a number is too great or too small if it is in
-    another unit."""
+    """Plausible range of a number, and factors to SI units from units that are often confused."""
 
     least: float
     most: float
     unit: str
     slips: tuple[tuple[float, str], ...]
 
-    def holds(self, value: float) -> bool:
+    def contains(self, value: float) -> bool:
         return self.least <= value <= self.most
 
     def slip(self, value: float) -> str:
-        """The units that the number may be in."""
-        fitting = [name for factor, name in self.slips if self.holds(value * factor)]
+        """Question that names the units the number may have; empty if none fits."""
+        fitting = [name for factor, name in self.slips if self.contains(value * factor)]
         return f"; is it in {' or '.join(fitting)}?" if fitting else ""
 
 
@@ -62,23 +61,23 @@ class _Measures(NamedTuple):
 
 
 def warnings_of(scene: Scene) -> tuple[str, ...]:
-    """Sentences about numbers of a scene that are implausible; none while they are traced."""
+    """Sentences about implausible numbers of a scene; none for traced numbers."""
     return () if _unknown(scene) else tuple(_doubts(scene))
 
 
 def strain_warnings(eq: Equilibrium) -> tuple[str, ...]:
-    """A sentence about strains of a solved arm for which a linear material is doubtful; none while
-    it is traced, or if it failed."""
+    """A sentence if strains of a solved arm are too large for a linear material; none for traced or
+    failed solves."""
     if _unknown(eq) or jnp.ndim(eq.status) or not bool(eq.converged):
         return ()
     largest = float(_largest_strain(eq))
     if largest <= LARGEST_STRAIN:
         return ()
-    said = f"strain: up to {largest:.2g}; beyond {LARGEST_STRAIN:g} a linear material is doubtful"
-    return (f"{said}; are moduli, sizes and inputs in SI units?",)
+    text = f"strain: up to {largest:.2g}; beyond {LARGEST_STRAIN:g} a linear material is doubtful"
+    return (f"{text}; are moduli, sizes and inputs in SI units?",)
 
 
-def _unknown(tree: Any) -> bool:
+def _unknown(tree: PyTree) -> bool:
     return any(is_traced(leaf) for leaf in jax.tree.leaves(tree))
 
 
@@ -95,9 +94,9 @@ def _doubts(scene: Scene) -> Iterator[str]:
         )
     slenderness = length / thickness
     if (
-        _LENGTH.holds(length)
-        and _THICKNESS.holds(thickness)
-        and not _SLENDERNESS.holds(slenderness)
+        _LENGTH.contains(length)
+        and _THICKNESS.contains(thickness)
+        and not _SLENDERNESS.contains(slenderness)
     ):
         yield (
             f"rod: {slenderness:.3g} times as long as half its thickness; "
@@ -130,19 +129,19 @@ def _doubts(scene: Scene) -> Iterator[str]:
             )
 
 
-def _outside(name: str, values: Any, range_: _Range, usual: str) -> Iterator[str]:
+def _outside(name: str, values: np.ndarray | float, range_: _Range, usual: str) -> Iterator[str]:
     for value in np.atleast_1d(values).tolist():
-        if not range_.holds(value):
+        if not range_.contains(value):
             yield f"{name}: {value:.6g} {range_.unit}; {usual}{range_.slip(value)}"
             return
 
 
-def _moduli(material: dict[str, Any]) -> Iterator[str]:
-    """Young's and the shear modulus belong to one material, if both are what materials have."""
+def _moduli(material: dict[str, np.ndarray]) -> Iterator[str]:
+    """Warns if the ratio of two moduli, each plausible by itself, is implausible."""
     if "shear" not in material:
         return
     young, shear = (float(np.mean(material[name])) for name in ("young", "shear"))
-    if _MODULUS.holds(young) and _MODULUS.holds(shear) and not 0.01 <= young / shear <= 1000:
+    if _MODULUS.contains(young) and _MODULUS.contains(shear) and not 0.01 <= young / shear <= 1000:
         yield (
             f"rod.material: young {young:.6g} Pa and shear {shear:.6g} Pa; "
             "their ratio is 2 to 3 in most materials; are both in Pa?"

@@ -1,12 +1,11 @@
-"""What the commands of `vsr-jax` share: exit codes, the look of their help, and arguments that
-several take."""
+"""Shared by the commands of `vsr-jax`: exit codes, help format, common arguments, settings of the
+compiler."""
 
 import argparse
 import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -17,101 +16,120 @@ DONE, NOT_CONVERGED, BAD_USAGE = 0, 1, 2
 EXIT_CODES = "exit codes: 0 done, 1 a solve did not converge, 2 bad usage"
 
 
+Commands = argparse._SubParsersAction
+"""What `add_subparsers` returns."""
+
+
 def command(
-    commands: Any, name: str, *, example: str, run: Callable, more: str = "", **texts: str
+    commands: Commands,
+    name: str,
+    *,
+    example: str,
+    run: Callable,
+    help: str,
+    description: str,
+    more: str = "",
 ) -> argparse.ArgumentParser:
-    """A command with an example, `more` under it, and the exit codes at the end of its help."""
+    """Adds a command whose help ends with an example, the text `more` and the exit codes."""
     epilog = f"example:\n  {example}\n{more}\n{EXIT_CODES}"
     parser = commands.add_parser(
-        name, epilog=epilog, formatter_class=argparse.RawDescriptionHelpFormatter, **texts
+        name,
+        help=help,
+        description=description,
+        epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.set_defaults(run=run)
     return parser
 
 
-def positive(text: str) -> int:
-    """A whole number of at least 1."""
+def positive_integer(text: str) -> int:
+    """Integer >= 1 from an argument."""
     number = int(text)
     if number < 1:
-        raise argparse.ArgumentTypeError(f"got {text}, need a whole number >= 1")
+        raise argparse.ArgumentTypeError(f"got {text}, need an integer >= 1")
     return number
 
 
 def check_folders(*paths: str | None) -> None:
-    """Refuses what could not be written, before the work is done."""
+    """Checks before any computation that files can be written.
+
+    **Raises:** `ValueError` for a path in a folder that does not exist.
+    """
     for path in paths:
         if path is not None and not Path(path).parent.is_dir():
             raise ValueError(f"{path}: there is no folder {str(Path(path).parent)!r}")
 
 
 def warn(sentences: Iterable[str]) -> None:
-    """Prints warnings to stderr, each in a line."""
+    """Prints warnings to stderr, one per line."""
     for sentence in sentences:
         print(f"vsr-jax: warning: {sentence}", file=sys.stderr)
 
 
-def add_bounds(parser: argparse.ArgumentParser, usual: str) -> None:
-    """The arguments of `bounds`; `usual`: what the greatest inputs are where they are not given."""
+def add_bounds(parser: argparse.ArgumentParser, default: str) -> None:
+    """Adds `--low` and `--high`, see `bounds`; `default` describes the default of `--high`."""
     parser.add_argument(
         "--low",
         metavar="U",
         nargs="+",
         type=float,
-        help="least inputs, one for all or one an actuator (default: 0)",
+        help="least inputs, one number for all or one per actuator (default: 0)",
     )
     parser.add_argument(
-        "--high", metavar="U", nargs="+", type=float, help=f"greatest inputs (default: {usual})"
+        "--high", metavar="U", nargs="+", type=float, help=f"greatest inputs (default: {default})"
     )
 
 
 def add_precision(parser: argparse.ArgumentParser) -> None:
-    """The argument of `use`."""
+    """Adds `--precision`, see `set_precision`."""
     parser.add_argument(
         "--precision",
         choices=("float64", "float32"),
         default="float64",
-        help="of all numbers (default: %(default)s)",
+        help="precision of all numbers (default: %(default)s)",
     )
 
 
-def use(precision: str) -> None:
-    """Has JAX know double precision, if that is asked for; comes before any number is made."""
+def set_precision(precision: str) -> None:
+    """Enables double precision in JAX if needed; call it before any array is created."""
     if precision == "float64":
         jax.config.update("jax_enable_x64", True)
 
 
 def bounds(
-    low: Sequence[float] | None, high: Sequence[float] | None, usual: np.ndarray
+    low: Sequence[float] | None, high: Sequence[float] | None, default: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Least and greatest inputs, one number an actuator, from `--low` and `--high`: 0 and `usual`
-    where they are not given.
+    """Least and greatest inputs, one number per actuator, from `--low` and `--high`; by default 0
+    and `default`.
 
-    **Raises:** `ValueError` for another number of them, and where they are crossed.
+    **Raises:** `ValueError` for a wrong number of values, and if a lower bound exceeds its upper
+    bound.
     """
     pair = []
     for name, values in (
         ("--low", [0.0] if low is None else low),
-        ("--high", usual if high is None else high),
+        ("--high", default if high is None else high),
     ):
-        if len(values) not in (1, len(usual)):
+        if len(values) not in (1, len(default)):
             raise ValueError(
-                f"{name}: got {len(values)} numbers, need one for all actuators or {len(usual)}, "
+                f"{name}: got {len(values)} numbers, need one for all actuators or {len(default)}, "
                 f"one for each"
             )
-        pair.append(np.broadcast_to(np.asarray(values, float), usual.shape))
+        pair.append(np.broadcast_to(np.asarray(values, float), default.shape))
     if np.any(pair[0] > pair[1]):
         low_row, high_row = (" ".join(f"{value:g}" for value in row) for row in pair)
         raise ValueError(f"--low: got {low_row}, need at most --high, {high_row}")
     return pair[0], pair[1]
 
 
-def hasten(*, optimise: bool) -> None:
-    """Has XLA compile a program that runs once in half the time, unless XLA_FLAGS says what to do;
-    comes before anything is computed.
+def reduce_compile_time(*, optimise: bool) -> None:
+    """Halves the compile time of a program that runs once, unless XLA_FLAGS is set; call it before
+    any computation.
 
-    Kernels are emitted without MLIR, whose passes cost a hundredth of a second for each of them,
-    and if not `optimise` they are left as they are. A flag that a release does not know ends the
-    process: so only for releases that know these.
+    XLA then emits CPU kernels without MLIR, whose passes take about 10 ms per kernel; without
+    `optimise` it also skips its own optimisation passes. XLA aborts on unknown flags, so they are
+    set only for releases that know them.
     """
     if jax.__version_info__ < (0, 11):
         flags = (
@@ -121,11 +139,11 @@ def hasten(*, optimise: bool) -> None:
         os.environ.setdefault("XLA_FLAGS", " ".join(flags))
 
 
-def one_device_a_core() -> None:
-    """Has JAX see each core of the machine's CPU as a device, unless XLA_FLAGS says what to do;
-    comes before anything is computed.
+def one_device_per_core() -> None:
+    """Makes each CPU core a JAX device, unless XLA_FLAGS is set; call it before any computation.
 
-    Devices work on samples of their own, where threads within one operation wait for each other.
+    Devices compute separate samples in parallel, whereas threads within one operation wait for each
+    other.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count={cores}")

@@ -1,40 +1,51 @@
-"""The command `vsr-jax design`: numbers of a scene that make an objective least."""
+"""The command `vsr-jax design`: numbers of a scene that minimise an objective."""
 
 import argparse
+import textwrap
 from typing import Any
 
 import numpy as np
 
 from ..analysis.plausible import warnings_of
+from ..arm.scene import Scene
 from ..files.scene_file import save as save_scene
-from ..optimization.design_file import load_design
-from .common import DONE, NOT_CONVERGED, add_precision, check_folders, command, hasten, use, warn
+from .common import (
+    DONE,
+    NOT_CONVERGED,
+    Commands,
+    add_precision,
+    check_folders,
+    command,
+    reduce_compile_time,
+    set_precision,
+    warn,
+)
 from .scene_commands import save
 
 
-def add_design(commands: Any) -> None:
+def add_design(commands: Commands) -> None:
     """Adds `vsr-jax design`."""
     parser = command(
         commands,
         "design",
-        help="find routings, sizes and inputs by gradient",
-        description="Numbers of a scene that make objectives least under constraints, as a "
-        "problem file asks for them.",
+        help="find routings, sizes and inputs by gradient descent",
+        description="Finds numbers of a scene that minimise objectives under constraints, as "
+        "specified by a problem file.",
         example="vsr-jax design problem.toml --out designed.toml --plot design.png",
-        more="  Problem files: see `python -c 'import vsr_jax.designfile as d; "
-        "print(d.__doc__)'`; one lies in notebooks/problems/.\n"
-        "  Exit code 1: no design keeps all constraints.",
+        more="  Problem files: see `python -c 'import vsr_jax.optimization.design_file as d; "
+        "print(d.__doc__)'`; an example is in notebooks/problems/.\n"
+        "  Exit code 1: no design satisfies all constraints.",
         run=_design,
     )
     parser.add_argument(
         "problem",
         metavar="PROBLEM.toml",
-        help="what is free, what is to be least, what is to be kept",
+        help="free numbers, objectives and constraints",
     )
     parser.add_argument(
         "--out",
         metavar="SCENE.toml",
-        help="a scene file for the design, with its first set of inputs",
+        help="save the design as a scene file, with its first set of inputs",
     )
     parser.add_argument(
         "--json",
@@ -42,55 +53,45 @@ def add_design(commands: Any) -> None:
         help="save numbers, margins, all inputs and the objective of each start",
     )
     parser.add_argument(
-        "--plot", metavar="PNG", help="draw the arm before and after, and how the objective fell"
+        "--plot",
+        metavar="PNG",
+        help="draw the arm before and after, and the history of the objective",
     )
     parser.add_argument(
-        "--keep",
+        "--checkpoint",
         metavar="FILE",
-        help="keep what is reached in a file; the same command goes on from there",
+        help="checkpoint file; the same command resumes from it",
     )
     add_precision(parser)
 
 
 def _design(options: argparse.Namespace) -> int:
-    from ..arm.scene_numbers import matching, parameters
+    from ..optimization.design_file import load_design
     from ..optimization.design_search import design
 
-    hasten(optimise=True)
-    use(options.precision)
-    check_folders(options.out, options.json, options.plot, options.keep)
-    task = load_design(options.problem)
-    warn(warnings_of(task.scene))
-    inputs = np.asarray(task.inputs, options.precision)
-    found = design(task.scene, task.free, task.objective, inputs, out=options.keep, **task.settings)
-    known = parameters(found.scene)
-    names = [
-        name for pattern in task.free if pattern != "inputs" for name in matching(pattern, known)
-    ]
-    print(task.title or options.problem)
-    print(
-        f"  objective  {found.objective:.6g} after {len(found.trace.objective)} steps of "
-        f"{len(found.starts)} starts"
+    reduce_compile_time(optimise=True)
+    set_precision(options.precision)
+    check_folders(options.out, options.json, options.plot, options.checkpoint)
+    problem = load_design(options.problem)
+    warn(warnings_of(problem.scene))
+    inputs = np.asarray(problem.inputs, options.precision)
+    found = design(
+        problem.scene,
+        problem.free,
+        problem.objective,
+        inputs,
+        constraints=problem.constraints,
+        uncertain=problem.uncertain,
+        search=problem.search,
+        out=options.checkpoint,
     )
-    for name in names:
-        print(
-            f"  {name} = "
-            f"{np.array2string(np.asarray(known[name].value), precision=6, separator=', ')} "
-            f"[{known[name].unit or '?'}]"
-        )
-    if "inputs" in task.free:
-        print(
-            "  inputs     "
-            + "; ".join(", ".join(f"{x:.6g}" for x in row) for row in np.asarray(found.inputs))
-        )
-    for name, margin in found.margins.items():
-        print(f"  {name}: {'kept' if margin >= 0 else 'VIOLATED'}, margin {margin:.3g}")
+    print(problem.title or options.problem)
+    print(textwrap.indent(str(found), "  "))
     if options.out:
-        save_scene(found.scene, options.out, found.inputs[0], task.title)
+        save_scene(found.scene, options.out, found.inputs[0], problem.title)
     if options.json:
-        values = {name: np.asarray(known[name].value).tolist() for name in names}
         record = {
-            "title": task.title,
+            "title": problem.title,
             "objective": found.objective,
             "feasible": found.feasible,
             "margins": found.margins,
@@ -100,17 +101,17 @@ def _design(options: argparse.Namespace) -> int:
             options.json,
             {
                 **record,
-                "numbers": values,
+                "numbers": {name: np.asarray(x).tolist() for name, x in found.numbers.items()},
                 "inputs": np.asarray(found.inputs).tolist(),
                 "starts": starts,
             },
         )
     if options.plot:
-        _draw(task, found, inputs[0], options.plot)
+        _draw(problem.scene, found, inputs[0], options.plot)
     return DONE if found.feasible else NOT_CONVERGED
 
 
-def _draw(task: Any, found: Any, before: np.ndarray, path: str) -> None:
+def _draw(scene: Scene, found: Any, inputs: np.ndarray, path: str) -> None:
     import matplotlib
 
     matplotlib.use("agg")
@@ -119,8 +120,8 @@ def _draw(task: Any, found: Any, before: np.ndarray, path: str) -> None:
     from ..viz import plot_design
 
     figure = plt.figure(figsize=(10, 4.5))
-    plot_design.before_after(
-        task.scene, found, before, figure.add_axes((0.0, 0.05, 0.52, 0.9), projection="3d")
-    )
+    space = figure.add_subplot(projection="3d")
+    space.set_position((0.0, 0.05, 0.52, 0.9))
+    plot_design.before_after(scene, found, inputs, space)
     plot_design.history(found, figure.add_axes((0.66, 0.14, 0.32, 0.8)))
     figure.savefig(path, dpi=150)

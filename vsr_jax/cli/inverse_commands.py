@@ -1,26 +1,36 @@
-"""The command `reach`: the inputs that bring a scene's tip to a place."""
+"""The command `vsr-jax reach`: inputs that bring the tip of a scene to a position."""
 
 import argparse
-from typing import Any
+import textwrap
 
 import jax.numpy as jnp
 import numpy as np
 
 from ..analysis.plausible import strain_warnings
 from . import report
-from .common import DONE, NOT_CONVERGED, add_bounds, bounds, check_folders, command, hasten, warn
+from .common import (
+    DONE,
+    NOT_CONVERGED,
+    Commands,
+    add_bounds,
+    bounds,
+    check_folders,
+    command,
+    reduce_compile_time,
+    warn,
+)
 from .scene_commands import add_scene, model_between, save, task_of
 
 
-def add_reach(commands: Any) -> None:
-    """Adds the command `reach`."""
+def add_reach(commands: Commands) -> None:
+    """Adds `vsr-jax reach`."""
     parser = command(
         commands,
         "reach",
-        help="find the inputs of a scene file that bring its tip to a place",
-        description="Finds inputs between two bounds that bring the tip to a place with the least "
-        "effort, and solves the scene there.\n"
-        "Ends with 1 where the place is out of reach; what is printed then is the nearest.",
+        help="find the inputs of a scene file that bring its tip to a position",
+        description="Finds inputs between two bounds that bring the tip to a position with the "
+        "least effort, and solves the scene there.\n"
+        "Exit code 1: the position is out of reach; the nearest point found is printed.",
         example="vsr-jax reach scene.toml --target 0.5 0.1 0.2 --high 12",
         run=_reach,
     )
@@ -31,9 +41,9 @@ def add_reach(commands: Any) -> None:
         nargs=3,
         type=float,
         required=True,
-        help="place of the tip [m]",
+        help="position of the tip [m]",
     )
-    add_bounds(parser, "twice --inputs, or those of the file")
+    add_bounds(parser, "twice --inputs, or twice the inputs of the file")
     parser.add_argument(
         "--allowed-miss",
         metavar="M",
@@ -48,7 +58,7 @@ def add_reach(commands: Any) -> None:
 def _reach(options: argparse.Namespace) -> int:
     from ..analysis.inverse import reach
 
-    hasten(optimise=True)
+    reduce_compile_time(optimise=True)
     task = task_of(options)
     check_folders(options.json)
     low, high = bounds(options.low, options.high, 2 * np.asarray(task.inputs))
@@ -61,16 +71,7 @@ def _reach(options: argparse.Namespace) -> int:
         allowed_miss=options.allowed_miss,
     )
     print("\n".join(report.lines(found.equilibrium, task.title or options.scene)))
-    print(f"  inputs     {', '.join(f'{value:.6g}' for value in np.asarray(found.inputs))}")
-    verdict = (
-        "within the"
-        if bool(found.reached)
-        else "out of reach, this is the nearest found: more than the"
-    )
-    print(
-        f"  miss       {float(found.miss):.2g} m, {verdict} {float(found.allowed_miss):.2g} m "
-        f"allowed"
-    )
+    print(textwrap.indent(str(found), "  "))
     warn(strain_warnings(found.equilibrium))
     if options.json:
         outcome = {

@@ -1,5 +1,5 @@
-"""The command `vsr-jax`: scenes solved, checked, swept, designed and told where to reach, the paper
-run anew, what things cost."""
+"""The command `vsr-jax`: solves, checks, sweeps and designs scenes, finds inputs for targets,
+reproduces the paper, measures costs."""
 
 import argparse
 import sys
@@ -23,16 +23,16 @@ EXAMPLES = (
     "vsr-jax effects",
     "vsr-jax accuracy scene.toml",
 )
-"""One for each command."""
+"""One example per command."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs the command with the arguments `argv`, those of the process by default.
+    """Runs the command with arguments `argv`, by default those of the process.
 
     **Returns:** the exit code: 0 done, 1 a solve did not converge, 2 bad usage.
 
-    **Raises:** `SystemExit` from argparse, with 0 after help or version, 2 for arguments it cannot
-    read.
+    **Raises:** `SystemExit` from argparse, with 0 after help or version, 2 for invalid
+    arguments.
     """
     options = _parser().parse_args(
         [_spaced(argument) for argument in (sys.argv[1:] if argv is None else argv)]
@@ -45,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _spaced(argument: str) -> str:
-    """Puts a space before a negative number: argparse would take -1e-3 for an option."""
+    """The argument, a negative number with a space in front: argparse takes -1e-3 for an option."""
     try:
         return f" {argument}" if float(argument) < 0 else argument
     except ValueError:

@@ -28,9 +28,9 @@ from .common import (
     add_precision,
     check_folders,
     command,
-    hasten,
-    positive,
-    use,
+    positive_integer,
+    reduce_compile_time,
+    set_precision,
     warn,
 )
 
@@ -118,7 +118,10 @@ def add_scene(parser: argparse.ArgumentParser) -> None:
         f"order {LEGENDRE_ORDER} for each free strain",
     )
     parser.add_argument(
-        "--steps", metavar="N", type=positive, help="steps along the arm (default: the model's)"
+        "--steps",
+        metavar="N",
+        type=positive_integer,
+        help="steps along the arm (default: the model's)",
     )
     parser.add_argument(
         "--tolerance",
@@ -129,8 +132,8 @@ def add_scene(parser: argparse.ArgumentParser) -> None:
     add_precision(parser)
 
 
-class Task(NamedTuple):
-    """What the command line and the file ask for."""
+class SceneTask(NamedTuple):
+    """Scene, inputs, model and title from the file and the command line."""
 
     scene: Scene
     inputs: Array
@@ -138,12 +141,12 @@ class Task(NamedTuple):
     title: str
 
 
-def task_of(options: argparse.Namespace) -> Task:
+def task_of(options: argparse.Namespace) -> SceneTask:
     """What is to be solved, in the precision asked for; warns of implausible numbers.
 
     **Raises:** `ValueError` for a file or numbers that make no sense.
     """
-    use(options.precision)
+    set_precision(options.precision)
     scene, inputs, title = load(options.scene)
     warn(warnings_of(scene))
     inputs = inputs if options.inputs is None else options.inputs
@@ -158,11 +161,11 @@ def task_of(options: argparse.Namespace) -> Task:
             "--tolerance: got --model or --steps too, need one or the other: a tolerance chooses "
             "both"
         )
-    return Task(scene, values, _model(options.model, options.steps, scene), title)
+    return SceneTask(scene, values, _model(options.model, options.steps, scene), title)
 
 
 def model_between(
-    task: Task, tolerance: float | None, low: np.ndarray, high: np.ndarray
+    task: SceneTask, tolerance: float | None, low: np.ndarray, high: np.ndarray
 ) -> Model | None:
     """The model asked for, or for inputs between two bounds the one that a tolerance takes."""
     if tolerance is None:
@@ -172,7 +175,7 @@ def model_between(
 
 
 def _solve(options: argparse.Namespace) -> int:
-    hasten(optimise=False)
+    reduce_compile_time(optimise=False)
     scene, inputs, model, title = task_of(options)
     check_folders(options.plot, options.json)
     eq = solve(scene, inputs, model=model, tolerance=options.tolerance)
@@ -184,7 +187,7 @@ def _solve(options: argparse.Namespace) -> int:
 def _check(options: argparse.Namespace) -> int:
     from . import report
 
-    hasten(optimise=True)
+    reduce_compile_time(optimise=True)
     scene, inputs, model, title = task_of(options)
     check_folders(options.json)
     model = (

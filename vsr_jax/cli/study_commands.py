@@ -1,28 +1,27 @@
-"""The commands that study: `paper` runs section IV of the paper anew, `effects` shows what each
-effect of a scene costs, `accuracy` what each digit costs."""
+"""The commands `vsr-jax paper`, `effects` and `accuracy`: reproduction of section IV of the paper,
+cost of each effect of a scene, cost of accuracy."""
 
 import argparse
 import sys
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ..models.strain_dependent import StrainDependent
-from .common import DONE, NOT_CONVERGED, check_folders, command, positive
-from .scene_commands import Task, save, task_of
+from .common import DONE, NOT_CONVERGED, Commands, check_folders, command, positive_integer
+from .scene_commands import SceneTask, save, task_of
 
 _GROUPS = ("steps", "bases", "continuum")
-"""Those of `accuracy`, which takes a second to import."""
+"""Copy of `studies.accuracy.GROUPS`; importing it takes a second."""
 
 
-def add_paper(commands: Any) -> None:
-    """Adds the command `paper`."""
+def add_paper(commands: Commands) -> None:
+    """Adds `vsr-jax paper`."""
     parser = command(
         commands,
         "paper",
-        help="run section IV of the paper anew: table and figures",
+        help="reproduce section IV of the paper: table and figures",
         description="Solves the cases of section IV of Renda et al. (2020) with every model, "
         "compares them with the reference\n"
         "solutions and writes table.md, table.json, Fig. 2 and, with case A2, Fig. 3 (PNG and "
@@ -35,51 +34,54 @@ def add_paper(commands: Any) -> None:
         "--out",
         metavar="DIR",
         default="paper",
-        help="folder for the results, made if need be (default: %(default)s)",
+        help="folder for the results, created if missing (default: %(default)s)",
     )
     parser.add_argument(
-        "--cases", metavar="CASE", nargs="+", help="cases among A1 A2 A3 B1 B2 C1 C2 (default: all)"
+        "--cases", metavar="CASE", nargs="+", help="some of A1 A2 A3 B1 B2 C1 C2 (default: all)"
     )
 
 
-def add_effects(commands: Any) -> None:
-    """Adds the command `effects`."""
+def add_effects(commands: Commands) -> None:
+    """Adds `vsr-jax effects`."""
     parser = command(
         commands,
         "effects",
-        help="what each effect of a scene costs on this machine",
-        description="Adds the effects to one arm, one after another: poses, gravity, a tip "
-        "wrench, a follower load, a second section,\n"
-        "a tendon driven by its length, friction. Prints operations of the compiled program (the "
-        "body of each loop counted\n"
-        "once), compile time and the times of a solve, alone and in a batch, each against the row "
-        "above. Takes a few minutes.",
+        help="measure what each effect of a scene costs on this machine",
+        description="Adds effects to one arm, one at a time: poses, gravity, a tip wrench, a "
+        "follower load, a second section,\n"
+        "a tendon driven by its length, friction. Prints the operations of the compiled program "
+        "(each loop body counted\n"
+        "once), the compile time and the time per solve, single and in a batch, with ratios to "
+        "the row above. Takes a few minutes.",
         example="vsr-jax effects --batch-size 64 --json effects.json",
         run=_effects,
     )
     parser.add_argument(
         "--batch-size",
-        type=positive,
+        type=positive_integer,
         default=256,
         help="shapes in the batch (default: %(default)s)",
     )
     parser.add_argument(
-        "--steps", type=positive, default=16, help="steps along the arm (default: %(default)s)"
+        "--steps",
+        type=positive_integer,
+        default=16,
+        help="steps along the arm (default: %(default)s)",
     )
-    parser.add_argument("--json", metavar="FILE", help="save the figures")
+    parser.add_argument("--json", metavar="FILE", help="save the results")
 
 
-def add_accuracy(commands: Any) -> None:
-    """Adds the command `accuracy`."""
+def add_accuracy(commands: Commands) -> None:
+    """Adds `vsr-jax accuracy`."""
     parser = command(
         commands,
         "accuracy",
-        help="show what accuracy costs on a scene, by every model",
-        description="Solves a scene, the paper's B2 by default, by every model at several "
-        "resolutions, for inputs drawn between a tenth\n"
-        "and the whole of those given. Prints errors of tip, strain and gradient and the times "
-        "they take, and says what to use for\n"
-        "a millimetre, a micrometre and a nanometre. Compiles some thirty programs three times: "
+        help="measure accuracy against time for every model",
+        description="Solves a scene, by default the paper's B2, with every model at several "
+        "resolutions, for random inputs between\n"
+        "10 % and 100 % of the given inputs. Prints errors of tip, strain and gradient with their "
+        "times, and recommends\n"
+        "a model for errors of 1 mm, 1 um and 1 nm. Compiles about thirty programs three times: "
         "five minutes, more with loads.",
         example="vsr-jax accuracy scene.toml --groups steps --plot accuracy.png --json "
         "accuracy.json",
@@ -93,7 +95,7 @@ def add_accuracy(commands: Any) -> None:
         metavar="U",
         nargs="+",
         type=float,
-        help="one number an actuator (default: those of the file)",
+        help="one number per actuator (default: those of the file)",
     )
     parser.add_argument(
         "--groups", nargs="+", choices=_GROUPS, default=list(_GROUPS), help="models (default: all)"
@@ -101,14 +103,14 @@ def add_accuracy(commands: Any) -> None:
     parser.set_defaults(model=None, steps=None, precision="float64")
     parser.add_argument(
         "--batch-size",
-        type=positive,
+        type=positive_integer,
         default=128,
         help="shapes in the batch (default: %(default)s)",
     )
     parser.add_argument(
-        "--plot", metavar="FILE", help="draw tip errors over times: .png, .pdf, .svg"
+        "--plot", metavar="FILE", help="plot tip errors against times: .png, .pdf, .svg"
     )
-    parser.add_argument("--json", metavar="FILE", help="save the figures")
+    parser.add_argument("--json", metavar="FILE", help="save the results")
 
 
 def _paper(options: argparse.Namespace) -> int:
@@ -122,7 +124,7 @@ def _paper(options: argparse.Namespace) -> int:
     rows = reproduction.run(options.out, tuple(CASES) if options.cases is None else options.cases)
     print(
         f"{len(rows)} solves of {', '.join(dict.fromkeys(row.case for row in rows))}; errors "
-        f"against the reference solutions:"
+        f"relative to the reference solutions:"
     )
     print("\n".join(reproduction.summary(rows)))
     figures = "fig2" if all(row.case != "A2" for row in rows) else "fig2 and fig3"
@@ -141,7 +143,7 @@ def _effects(options: argparse.Namespace) -> int:
     costs = effects.measure(
         options.batch_size,
         model=StrainDependent(options.steps),
-        say=lambda name: print(f"compiling: {name}", file=sys.stderr),
+        report=lambda message: print(message, file=sys.stderr),
     )
     print("\n".join(effects.table(costs)))
     if options.json:
@@ -149,12 +151,12 @@ def _effects(options: argparse.Namespace) -> int:
     return DONE if all(cost.converged == 1 for cost in costs) else NOT_CONVERGED
 
 
-def _two_helices(inputs: list[float] | None) -> Task:
+def _two_helices(inputs: list[float] | None) -> SceneTask:
     from ..studies import paper
 
     values = np.asarray([-15.0, -15.0] if inputs is None else inputs)
     scene = paper.scene("B2")
-    return Task(scene, scene.check_inputs(values), None, "B2, two helices")
+    return SceneTask(scene, scene.check_inputs(values), None, "B2, two helices")
 
 
 def _accuracy(options: argparse.Namespace) -> int:
@@ -167,17 +169,17 @@ def _accuracy(options: argparse.Namespace) -> int:
     check_folders(options.plot, options.json)
     task = task_of(options) if options.scene else _two_helices(options.inputs)
     shares = np.random.default_rng(0).uniform(0.1, 1.0, (options.batch_size, task.inputs.size))
-    ways = accuracy.settings(task.scene, groups=options.groups)
+    settings = accuracy.settings(task.scene, groups=options.groups)
     rows = accuracy.measure(
         task.scene,
         jnp.asarray(shares) * task.inputs,
-        ways,
-        say=lambda name: print(f"compiling: {name}", file=sys.stderr),
+        settings,
+        report=lambda message: print(message, file=sys.stderr),
     )
     print("\n".join([*accuracy.table(rows), "", *accuracy.advice(rows)]))
-    named = {task.title or options.scene: rows}
+    title = task.title or options.scene
     if options.json:
-        save(options.json, {name: [row._asdict() for row in some] for name, some in named.items()})
+        save(options.json, {title: [row._asdict() for row in rows]})
     if options.plot:
-        accuracy_figures.work_precision(named).savefig(options.plot, dpi=150)
+        accuracy_figures.work_precision({title: rows}).savefig(options.plot, dpi=150)
     return DONE if any(row.tip is not None for row in rows) else NOT_CONVERGED

@@ -18,8 +18,8 @@ from .common import (
     bounds,
     check_folders,
     command,
-    one_device_a_core,
-    positive,
+    one_device_per_core,
+    positive_integer,
 )
 from .scene_commands import add_scene, model_between, task_of
 
@@ -43,7 +43,7 @@ def add_sweep(commands: Any) -> None:
     parser.add_argument(
         "--samples",
         metavar="N",
-        type=positive,
+        type=positive_integer,
         default=10_000,
         help="how many (default: %(default)s)",
     )
@@ -69,7 +69,7 @@ def add_sweep(commands: Any) -> None:
 
 
 def _sweep(options: argparse.Namespace) -> int:
-    one_device_a_core()
+    one_device_per_core()
     task = task_of(options)
     check_folders(options.out, options.plot)
     actuators, dtype = len(task.scene.actuators), task.inputs.dtype

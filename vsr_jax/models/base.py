@@ -117,6 +117,10 @@ class Model(eqx.Module):
             f"q: got a solution by {type(self).__name__}, need one by StrainDependent or Prescribed"
         )
 
+    def dofs(self, scene: Scene) -> int | None:
+        """Number of degrees of freedom; None for a continuum."""
+        return None
+
     @abstractmethod
     def nodes(self, scene: Scene, forces: Vector, state: Any) -> Nodes:
         """What quantities along the arm are summed from."""

@@ -203,6 +203,9 @@ class Prescribed(SteppedModel):
     def coordinates(self, scene: Scene, forces: Vector, state: Array) -> Float[Array, " dofs"]:
         return state
 
+    def dofs(self, scene: Scene) -> int:
+        return self.basis.size
+
     def node_strain(self, scene: Scene, state: Array) -> Vector:
         X = self.grid(scene).X
         return tuple(x.reshape(X.shape) for x in self._strain(scene, state, X.reshape(-1)))

@@ -83,6 +83,9 @@ class StrainDependent(SteppedModel):
     def coordinates(self, scene: Scene, forces: Vector, state: Unknown) -> Float[Array, " dofs"]:
         return jnp.array(forces, state.xi[0].dtype)
 
+    def dofs(self, scene: Scene) -> int:
+        return len(scene.actuators)
+
     def strain(
         self, scene: Scene, forces: Vector, state: Unknown, X: Float[Array, " stations"]
     ) -> Vector:

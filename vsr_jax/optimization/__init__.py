@@ -1,6 +1,6 @@
 """Design by gradient: objectives, constraints, descent from many starts, checkpoints, design files.
 
-Imports optax when a design begins. Must not know pictures.
+Imports optax only when a design is set up. Does not import plotting.
 """
 
 from . import constraint, objective

@@ -1,14 +1,15 @@
-r"""Numbers kept between bounds by a smooth map: $p = p_0 + (p_1 - p_0) \sin^2(z / 2)$ for any z.
-The bounds themselves are reached.
+r"""Smooth map from the real line to an interval: $p = p_0 + (p_1 - p_0) \sin^2(z / 2)$ for any z.
+The ends of the interval are attained.
 
-Without bounds $p = \pi z$, of which z from 0 to $\pi$ are more than a turn and a half.
+Without bounds $p = \pi z$, so that $0 \le z \le \pi$ covers more than one and a half turns of an
+angle.
 """
 
 import jax.numpy as jnp
 from jaxtyping import Array
 
-_INSIDE = 0.01
-"""Share of the range by which starts keep off its ends, where the map's slope is nothing."""
+_INSET = 0.01
+"""Share of the range that starting points keep from its ends, where the map has zero slope."""
 
 
 def share(z: Array) -> Array:
@@ -17,18 +18,18 @@ def share(z: Array) -> Array:
 
 
 def at_share(share: Array) -> Array:
-    """The z of a share, which is taken a little off the ends."""
-    return 2 * jnp.arcsin(jnp.sqrt(jnp.clip(share, _INSIDE, 1 - _INSIDE)))
+    """Coordinate z of a share; shares at an end are moved slightly inside."""
+    return 2 * jnp.arcsin(jnp.sqrt(jnp.clip(share, _INSET, 1 - _INSET)))
 
 
 def number(low: Array, high: Array, z: Array) -> Array:
-    """The number at z; where the bounds are infinite it has none."""
-    endless = jnp.isinf(low)
-    start, span = jnp.where(endless, 0.0, low), jnp.where(endless, 0.0, high - low)
-    return jnp.where(endless, jnp.pi * z, start + span * share(z))
+    """Number at z; an infinite `low` means that there are no bounds."""
+    unbounded = jnp.isinf(low)
+    start, span = jnp.where(unbounded, 0.0, low), jnp.where(unbounded, 0.0, high - low)
+    return jnp.where(unbounded, jnp.pi * z, start + span * share(z))
 
 
 def coordinate(low: Array, high: Array, number: Array) -> Array:
-    """The z of a number, which is taken a little off the bounds."""
+    """Coordinate z of a number; numbers at a bound are moved slightly inside."""
     span = jnp.where(high > low, high - low, 1.0)
     return jnp.where(jnp.isinf(low), number / jnp.pi, at_share((number - low) / span))

@@ -1,5 +1,5 @@
-"""A long descent kept in a file: written after every chunk of steps, taken up again by the call
-that began it."""
+"""Checkpoint of a descent: a file written after every chunk of steps, from which the same call
+resumes."""
 
 import json
 import os
@@ -10,16 +10,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 
 from ..numerics.fingerprint import fingerprint
-from .descent import Problem, State, Trace, first_update
+from .descent import DescentState, DesignProblem, History, first_update
 
 
 class Checkpoint:
-    """The file of one problem with its settings: a line of JSON, then the arrays.
+    """File with the state of one descent: a line of JSON, then the arrays.
 
-    **Arguments:** `path`: the file, None to keep nothing; `problem`, `optimizer`, `settings`: what
-    tells this descent from others.
+    **Arguments:** `path`: the file; None writes nothing. `problem`, `optimizer`, `settings`: what
+    the fingerprint in the file identifies.
 
     **Raises:** `ValueError` for a path that cannot be written.
     """
@@ -27,58 +28,55 @@ class Checkpoint:
     def __init__(
         self,
         path: str | os.PathLike | None,
-        problem: Problem,
-        optimizer: Any,
-        settings: tuple[Any, ...],
+        problem: DesignProblem,
+        optimizer: optax.GradientTransformationExtraArgs,
+        settings: tuple[int, ...],
     ):
         self._path = None if path is None else Path(path)
         if self._path is None:
             return
         if not self._path.parent.is_dir() or self._path.is_dir():
-            raise ValueError(
-                f"design.out: got {str(path)!r}, need a file in a folder that is there"
-            )
+            raise ValueError(f"design.out: got {str(path)!r}, need a file in an existing folder")
         middle = jax.tree.map(lambda low, high: 0.5 * (low + high), problem.low, problem.high)
         rule = fingerprint(first_update, (optimizer, middle))
         self._digest = fingerprint(
             problem.terms, (middle,), problem.low, problem.high, rule, settings
         )
 
-    def begun(self, states: State) -> tuple[State, Trace]:
-        """Where the descent stands: as kept in the file, or at its first states.
+    def read(self, states: DescentState) -> tuple[DescentState, History]:
+        """States and history in the file; without a file the given states and an empty history.
 
-        **Raises:** `ValueError` for a file that holds something else.
+        **Raises:** `ValueError` for a file of another computation.
         """
         starts = states.best.objective.shape[0]
         none = np.zeros((0, starts), states.best.objective.dtype)
         if self._path is None or not self._path.exists():
-            return states, Trace(none, none)
+            return states, History(none, none)
         with self._path.open("rb") as file:
-            head = _head(file.readline())
-            if head.get("design") != self._digest:
+            header = _header(file.readline())
+            if header.get("design") != self._digest:
                 raise ValueError(
-                    f"design.out: {self._path} holds something else, need another file or the "
-                    f"call that made it"
+                    f"design.out: {self._path} belongs to another computation, need another file "
+                    f"or the same call"
                 )
-            like = np.zeros((head["steps"], starts), none.dtype)
-            return eqx.tree_deserialise_leaves(file, (states, Trace(like, like)))
+            like = np.zeros((header["steps"], starts), none.dtype)
+            return eqx.tree_deserialise_leaves(file, (states, History(like, like)))
 
-    def write(self, states: State, trace: Trace) -> None:
-        """Keeps where the descent stands; a process that dies in it leaves what was kept before."""
+    def write(self, states: DescentState, history: History) -> None:
+        """Replaces the file; an interrupted write leaves the previous file intact."""
         if self._path is None:
             return
         part = self._path.with_name(self._path.name + ".part")
+        header = {"design": self._digest, "steps": len(history.objective)}
         with part.open("wb") as file:
-            file.write(
-                json.dumps({"design": self._digest, "steps": len(trace.objective)}).encode() + b"\n"
-            )
-            eqx.tree_serialise_leaves(file, (jax.tree.map(jnp.asarray, states), trace))
+            file.write(json.dumps(header).encode() + b"\n")
+            eqx.tree_serialise_leaves(file, (jax.tree.map(jnp.asarray, states), history))
         part.replace(self._path)
 
 
-def _head(line: bytes) -> dict[str, Any]:
+def _header(line: bytes) -> dict[str, Any]:
     try:
-        head = json.loads(line)
+        header = json.loads(line)
     except ValueError:
         return {}
-    return head if isinstance(head, dict) else {}
+    return header if isinstance(header, dict) else {}

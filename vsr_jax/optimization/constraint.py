@@ -1,12 +1,12 @@
-r"""What a design has to keep to: margins without unit, each at least zero where it is kept."""
+r"""Constraints of a design: dimensionless margins, $g_k \ge 0$ where satisfied."""
 
 import dataclasses
 from abc import abstractmethod
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..typing import Scalar
@@ -14,18 +14,19 @@ from ..validation import numbers, positive
 from .objective import Arms
 
 _STATIONS = 65
+"""Stations along the arm at which margins are sampled, less than 2 % of the length apart."""
 
 
 class Constraint(eqx.Module):
-    """Margins that are to be at least zero."""
+    """Margins that must not be negative."""
 
     @abstractmethod
     def __call__(self, arms: Arms) -> Float[Array, " margins"]:
-        """The margins, in a row."""
+        """Margins, shape (margins,)."""
 
     def __str__(self) -> str:
-        said = (f"{field.name}={getattr(self, field.name)}" for field in dataclasses.fields(self))
-        return f"{type(self).__name__}({', '.join(said)})"
+        fields = (f"{field.name}={getattr(self, field.name)}" for field in dataclasses.fields(self))
+        return f"{type(self).__name__}({', '.join(fields)})"
 
 
 def _stations(arms: Arms) -> Float[Array, " stations"]:
@@ -33,15 +34,15 @@ def _stations(arms: Arms) -> Float[Array, " stations"]:
 
 
 class Inside(Constraint):
-    """Threads inside the section, or the rod's guides, and off its wall: distance to the wall less
-    `wall`, by that of the axis.
+    """Threads inside the section, or inside the rod's guides: (distance to the wall - `wall`) /
+    distance of the axis to the wall.
 
-    **Arguments:** `wall` [m]: distance between a thread and the wall.
+    **Arguments:** `wall` [m]: least distance between a thread and the wall.
     """
 
     wall: Scalar
 
-    def __init__(self, wall: Any = 0.0):
+    def __init__(self, wall: ArrayLike = 0.0):
         self.wall = numbers("Inside.wall", wall, least=0.0)
 
     def __call__(self, arms: Arms) -> Float[Array, " margins"]:
@@ -56,10 +57,10 @@ class Inside(Constraint):
 
 
 class MinSpacing(Constraint):
-    r"""Threads apart from each other: $|d_i - d_j|^2 / g^2 - 1$ at stations along the arm, for
+    r"""Least distance between threads: $|d_i - d_j|^2 / g^2 - 1$ at stations along the arm, for
     every pair.
 
-    **Arguments:** `gap`: g [m], between the middles of two threads.
+    **Arguments:** `gap`: g [m], between the centre lines of two threads.
     """
 
     gap: float = eqx.field(static=True)
@@ -84,8 +85,8 @@ def _where_laid(margins: Array, reach: Array | None) -> Array:
 
 
 class MaxTension(Constraint):
-    r"""Forces of threads bounded: $1 - |\tau_i| / \tau_1$; of inputs that are free their bounds say
-    the same.
+    r"""Bounded thread forces: $1 - |\tau_i| / \tau_1$. For free inputs that are forces, bounds have
+    the same effect.
 
     **Arguments:** `force`: $\tau_1$ [N].
     """
@@ -100,7 +101,7 @@ class MaxTension(Constraint):
 
 
 class BendRadius(Constraint):
-    r"""The axis bent no tighter than a radius: $1 - R^2 (k_y^2 + k_z^2)$ at stations along the arm.
+    r"""Least bending radius of the axis: $1 - R^2 (k_y^2 + k_z^2)$ at stations along the arm.
 
     **Arguments:** `least`: R [m].
     """
@@ -116,10 +117,9 @@ class BendRadius(Constraint):
 
 
 class StabilityMargin(Constraint):
-    """`eq.stability` at least a given margin.
+    """Least stability margin: `eq.stability - least`.
 
-    **Arguments:** `least`: between 0, where an equilibrium ceases to be stable, and 1, an arm
-    without forces.
+    **Arguments:** `least`: between 0, the limit of stability, and 1, an arm without forces.
     """
 
     least: float = eqx.field(static=True)

@@ -1,8 +1,8 @@
-"""Problems of design as TOML files.
+"""Design problems as TOML files.
 
-title = "A helix that reaches out" scene = "helix.toml" # beside this file; or a table [scene], as
-in a scene file inputs = [[5.0]] # one row a set of inputs steps = 400 # and other numbers that
-`design` takes: starts, learning_rate, candidates, seed, enough, patience
+title = "A helix that reaches out"
+scene = "helix.toml"    # relative to this file; or a table [scene], as in a scene file
+inputs = [[5.0]]        # one row per set of inputs
 
 [free]
 "actuators[0].routing.radius" = [0.002, 0.009]
@@ -19,6 +19,11 @@ targets = [[0.5, 0.1, 0.2]]
 [[constraints]]
 type = "Inside"
 wall = 0.001
+
+[search]                # the arguments of `Search`, all optional, without `optimizer`
+starts = 8
+steps = 400
+learning_rate = 0.05
 """
 
 import tomllib
@@ -31,6 +36,8 @@ from ..files.scene_file import at, check_keys, kind_of, load, parse_table
 from . import constraint, objective
 from .constraint import Constraint
 from .objective import Objective
+from .problem import Bounds
+from .search import Search
 
 _OBJECTIVES = {
     kind.__name__: kind
@@ -52,26 +59,26 @@ _CONSTRAINTS = {
         constraint.StabilityMargin,
     )
 }
-_SETTINGS = ("starts", "steps", "learning_rate", "candidates", "seed", "enough", "patience")
-_KEYS = ("title", "scene", "inputs", "free", "uncertain", "objectives", "constraints")
+_KEYS = ("title", "scene", "inputs", "free", "uncertain", "objectives", "constraints", "search")
 
 
 class DesignFile(NamedTuple):
-    """What a file asks for: the `title`, and the arguments of `design`, those by name in
-    `settings`."""
+    """Contents of a file: its `title`, and arguments of `design` by name."""
 
     title: str
     scene: Scene
-    free: dict[str, Any]
+    free: dict[str, Bounds]
     objective: Objective
-    inputs: Any
-    settings: dict[str, Any]
+    inputs: list[list[float]]
+    constraints: list[Constraint]
+    uncertain: dict[str, float]
+    search: Search
 
 
 def load_design(path: str | PathLike[str]) -> DesignFile:
-    """Reads a problem of design from a TOML file.
+    """Reads a design problem from a TOML file.
 
-    **Raises:** `ValueError` of one line that begins with the file's name, as `load`.
+    **Raises:** a one-line `ValueError` that begins with the file's name, as `load`.
     """
     try:
         table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
@@ -86,33 +93,33 @@ def load_design(path: str | PathLike[str]) -> DesignFile:
 
 
 def _parsed(table: dict[str, Any], folder: Path) -> DesignFile:
-    known = (*_KEYS, *_SETTINGS)
-    unknown = [key for key in table if key not in known]
+    known = ", ".join(sorted(_KEYS))
+    unknown = [key for key in table if key not in _KEYS]
     if unknown:
-        raise ValueError(f"unknown key {unknown[0]!r}, known are {', '.join(sorted(known))}")
+        raise ValueError(f"unknown key {unknown[0]!r}, known are {known}")
     missing = [key for key in ("scene", "free", "objectives") if key not in table]
     if missing:
-        raise ValueError(f"missing key {missing[0]!r}, known are {', '.join(sorted(known))}")
-    kept = (
+        raise ValueError(f"missing key {missing[0]!r}, known are {known}")
+    file = (
         load(folder / table["scene"])
         if isinstance(table["scene"], str)
         else parse_table(table["scene"], "scene")
     )
-    inputs = table.get("inputs", None if kept.inputs is None else [kept.inputs.tolist()])
+    inputs = table.get("inputs", None if file.inputs is None else [file.inputs.tolist()])
     if inputs is None:
         raise ValueError("missing key 'inputs', and the scene has none")
-    settings = {name: table[name] for name in _SETTINGS if name in table}
-    settings["constraints"] = [
-        _constraint(one, f"constraints[{i}]") for i, one in enumerate(_tables(table, "constraints"))
-    ]
-    settings["uncertain"] = table.get("uncertain", {})
     return DesignFile(
         str(table.get("title", "")),
-        kept.scene,
+        file.scene,
         table["free"],
         _objective(_tables(table, "objectives")),
         inputs,
-        settings,
+        [
+            _constraint(one, f"constraints[{i}]")
+            for i, one in enumerate(_tables(table, "constraints"))
+        ],
+        table.get("uncertain", {}),
+        _search(table.get("search", {})),
     )
 
 
@@ -136,6 +143,12 @@ def _objective(tables: list[dict[str, Any]]) -> Objective:
 
 def _constraint(table: dict[str, Any], path: str) -> Constraint:
     return _made(table, path, _CONSTRAINTS)
+
+
+def _search(table: dict[str, Any]) -> Search:
+    if not isinstance(table, dict) or "optimizer" in table:
+        raise ValueError(f"search: got {table!r}, need a table of numbers")
+    return _made({"type": "Search", **table}, "search", {"Search": Search})
 
 
 def _made(table: dict[str, Any], path: str, group: dict[str, type]) -> Any:

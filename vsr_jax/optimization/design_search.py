@@ -1,37 +1,51 @@
-r"""Design by gradient: numbers of a scene and its inputs that make an objective least under
+r"""Design by gradient: numbers of a scene and its inputs that minimise an objective under
 constraints.
 
-$$\min_p f(p) \quad \text{with} \quad g_k(p) \ge 0, \quad p_0 \le p \le p_1,$$
+$\min_p f(p) \quad \text{subject to} \quad g_k(p) \ge 0, \quad p_0 \le p \le p_1$
 
-where every evaluation solves the scene for several sets of inputs, and the derivatives are those of
-the equilibria.
+Every evaluation solves the scene for several sets of inputs. The derivatives are the implicit
+derivatives of the equilibria.
 """
 
 import os
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
-import optax
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 from tqdm import tqdm
 
 from ..arm.scene import Scene
+from ..arm.scene_numbers import parameters
 from ..models.base import Model
-from ..validation import count, positive
+from ..typing import Scalar
+from ..validation import instance, is_traced
 from .checkpoint import Checkpoint
 from .constraint import Constraint
-from .descent import Problem, State, Trace, adam, begin, chosen, descend, weight
-from .problem import Terms, posed
+from .descent import (
+    DescentState,
+    DesignProblem,
+    History,
+    begin,
+    best_start,
+    descend,
+    penalty_weight,
+)
+from .objective import Arms, Objective
+from .problem import INPUTS, Bounds, Terms, formulate
+from .search import Search
 
 _CHUNK = 25
-_LEVEL = 1e-4
+"""Steps between two checkpoints and between two tests of when to stop: each of them waits for the
+device."""
 
 
 class Start(NamedTuple):
-    """What one start came to: its best scene and inputs, their objective, and the greatest
-    violation of a constraint, 0 if feasible."""
+    """Result of one start: its best scene and inputs, their objective, and the largest violation of
+    a constraint, 0 if feasible."""
 
     scene: Scene
     inputs: Float[Array, "sets inputs"]
@@ -40,15 +54,15 @@ class Start(NamedTuple):
 
 
 class Design(NamedTuple):
-    """What `design` found.
+    """Result of `design`; `print` it for a summary.
 
-    - `scene`, `inputs` (sets, actuators): the best; a scene like any other, which can be solved,
-      saved and designed further.
-    - `objective`: its value there. `feasible`: whether it keeps all constraints.
-    - `margins`: the least margin of each constraint by name, without unit, negative where it is
-      violated.
-    - `starts`: the best of each start, in order. `trace`: objective and violation of each start at
-      each step taken.
+    - `scene`, `inputs` (sets, actuators): the best; the scene can be solved, saved and designed
+      further.
+    - `objective`: its value there. `feasible`: whether all constraints are satisfied.
+    - `margins`: least margin of each constraint by name, dimensionless, negative if violated.
+    - `free`: names of the free numbers.
+    - `starts`: the best of each start, in order. `history`: objective and violation of each start
+      at each step.
     """
 
     scene: Scene
@@ -56,177 +70,178 @@ class Design(NamedTuple):
     objective: float
     feasible: bool
     margins: dict[str, float]
+    free: tuple[str, ...]
     starts: tuple[Start, ...]
-    trace: Trace
+    history: History
+
+    @property
+    def numbers(self) -> dict[str, Array]:
+        """Free numbers of the best scene by name, without the inputs."""
+        known = parameters(self.scene)
+        return {name: known[name].value for name in self.free if name != INPUTS}
+
+    def __str__(self) -> str:
+        known = parameters(self.scene)
+        lines = [
+            f"objective  {self.objective:.6g} after {len(self.history.objective)} steps of "
+            f"{len(self.starts)} starts"
+        ]
+        lines += [
+            f"{name} = {_text(known[name].value)} [{known[name].unit or '?'}]"
+            for name in self.free
+            if name in known
+        ]
+        if INPUTS in self.free:
+            lines.append(f"inputs     {_rows(self.inputs)}")
+        lines += [
+            f"{name}: {'satisfied' if margin >= 0 else 'VIOLATED'}, margin {margin:.3g}"
+            for name, margin in self.margins.items()
+        ]
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+
+def _text(value: Array) -> str:
+    if is_traced(value) or not eqx.is_array_like(value):
+        return str(value)
+    return np.array2string(np.asarray(value), precision=6, separator=", ")
+
+
+def _rows(inputs: Array) -> str:
+    if is_traced(inputs) or not eqx.is_array_like(inputs) or np.ndim(inputs) != 2:
+        return _text(inputs)
+    return "; ".join(", ".join(f"{x:.6g}" for x in row) for row in np.asarray(inputs))
 
 
 def design(
     scene: Scene,
-    free: Mapping[str, Any],
-    objective: Any,
-    inputs: Any,
+    free: Mapping[str, Bounds],
+    objective: Objective | Callable[[Arms], Scalar],
+    inputs: ArrayLike | Sequence,
     *,
     constraints: Sequence[Constraint] = (),
     uncertain: Mapping[str, float] | None = None,
     model: Model | None = None,
-    starts: int = 8,
-    steps: int = 400,
-    learning_rate: float = 0.05,
-    optimizer: optax.GradientTransformation | None = None,
-    candidates: int = 64,
-    seed: int = 0,
-    enough: float | None = None,
-    patience: int | None = None,
+    search: Search | None = None,
     out: str | os.PathLike | None = None,
     progress: bool = True,
 ) -> Design:
-    r"""Numbers of a scene that make an objective least: routings, tapers, moduli, lengths, rest
+    r"""Numbers of a scene that minimise an objective: routings, tapers, moduli, lengths, rest
     curvature, inputs.
 
         free = {
             "actuators[0].routing.radius": (0.002, 0.009),
             "actuators[0].routing.angle": (1.3, 1.55),
         }
-        kept = [vsr.constraint.Inside(wall=0.001)]
         found = vsr.design(
-            scene, free, vsr.objective.CurveError(points), [[8.0]], constraints=kept
+            scene,
+            free,
+            vsr.objective.CurveError(points),
+            [[8.0]],
+            constraints=[vsr.constraint.Inside(wall=0.001)],
+            search=vsr.Search(starts=16),
         )
         vsr.save(found.scene, "designed.toml", found.inputs[0])
 
-    Free numbers are kept between their bounds by $p = p_0 + (p_1 - p_0) \sin^2(z / 2)$, constraints
-    by penalties on their way and by the choice among what keeps them in the end. All starts go side
-    by side in one compiled program.
+    The map $p = p_0 + (p_1 - p_0) \sin^2(z / 2)$ keeps free numbers between their bounds.
+    Constraints enter as penalties; the result is the best of the feasible points. All starts run in
+    parallel in one compiled program.
 
     **Arguments:**
-    - `scene`: where the design begins; its numbers are the first start.
-    - `free`: bounds by name, as `vsr_jax.parameters` tells of them: a pair of numbers, or of arrays
-      of the number's shape. `[*]` stands for every index; `inputs` for all inputs. A phase may have
-      None, to turn without end.
+    - `scene`: the initial scene; its numbers are the first start.
+    - `free`: bounds by name, see `vsr_jax.parameters`: a pair of numbers, or of arrays of the
+      number's shape. `[*]` stands for every index, `inputs` for all inputs. None leaves a phase
+      without bounds.
     - `objective`: an `Objective`, or a function of `Arms`.
-    - `inputs`: the sets of inputs, shape (sets, actuators), one row for one set. Their dtype is the
-      precision.
-    - `constraints`: `Inside()`, threads inside the section, is kept in any case.
+    - `inputs`: sets of inputs, shape (sets, actuators). Their dtype is the precision.
+    - `constraints`: `Inside()`, threads inside the section, is always added if it is missing.
     - `uncertain`: relative standard deviations by name; the objective becomes its mean over eight
-      scenes drawn so.
+      random scenes.
     - `model`: as for `solve`.
-    - `starts`: the first is the scene itself, each other the best of `candidates` that are drawn
-      between the bounds from `seed`.
-    - `steps`, `learning_rate`: of Adam, whose learning_rate falls along a cosine; `optimizer`:
-      another one of optax.
-    - `enough`: value of the objective to stop at; `patience`: steps without gain of a
-      ten-thousandth after which to stop.
-    - `out`: a file to keep what is reached in; the same call goes on from there.
-    - `progress`: whether to show a bar.
+    - `search`: number of starts and steps, optimizer, when to stop; `Search()` by default.
+    - `out`: checkpoint file; the same call resumes from it.
+    - `progress`: whether to show a progress bar.
 
     **Returns:** a `Design`.
 
-    **Raises:** `ValueError` if nothing is free, for unknown names, bounds that contradict each
-    other, targets that do not fit the sets of inputs, inputs out of range, and if not one start is
-    in equilibrium anywhere.
+    **Raises:** `ValueError` if nothing is free, for unknown names, contradictory bounds, targets
+    that do not match the sets of inputs, inputs out of range, and if no start finds an equilibrium.
     """
-    problem, terms, given = posed(
+    problem, terms, given = formulate(
         scene, free, objective, inputs, constraints, uncertain or {}, model
     )
-    total = count("design.steps", steps)
-    method = (
-        adam(positive("design.learning_rate", learning_rate), total)
-        if optimizer is None
-        else optax.with_extra_args_support(optimizer)
-    )
-    many = count("design.starts", starts)
-    kept = Checkpoint(
-        out, problem, method, (many, count("design.candidates", candidates), seed, total)
-    )
-    states = begin(problem, method, given, many, candidates, seed)
-    states, trace = _run(problem, method, kept, states, total, _Stop(enough, patience), progress)
-    return _result(problem, terms, states, trace)
-
-
-class _Stop(NamedTuple):
-    """When a descent has done enough."""
-
-    enough: float | None
-    patience: int | None
-
-    def says(self, trace: Trace) -> bool:
-        reached = np.minimum.accumulate(
-            np.min(np.where(trace.violation <= 0, trace.objective, np.inf), axis=1)
-        )
-        if self.enough is not None and reached[-1] <= self.enough:
-            return True
-        if (
-            self.patience is None
-            or len(reached) <= self.patience
-            or not np.isfinite(reached[-1 - self.patience])
-        ):
-            return False
-        before = reached[-1 - self.patience]
-        return before - reached[-1] <= _LEVEL * abs(before)
+    search = Search() if search is None else search
+    instance("search", search, Search, "a Search")
+    rule, settings = search.update_rule, (search.starts, search.candidates, search.seed)
+    checkpoint = Checkpoint(out, problem, rule, (*settings, search.steps))
+    states = begin(problem, rule, given, *settings)
+    states, history = _run(problem, search, checkpoint, states, progress)
+    return _result(problem, terms, states, history)
 
 
 def _run(
-    problem: Problem,
-    method: Any,
-    kept: Checkpoint,
-    states: State,
-    total: int,
-    stop: _Stop,
+    problem: DesignProblem,
+    search: Search,
+    checkpoint: Checkpoint,
+    states: DescentState,
     progress: bool,
-) -> tuple[State, Trace]:
-    states, trace = kept.begun(states)
+) -> tuple[DescentState, History]:
+    states, history = checkpoint.read(states)
+    rule, total = search.update_rule, search.steps
     with tqdm(
-        total=total, initial=len(trace.objective), unit=" steps", disable=not progress
+        total=total, initial=len(history.objective), unit=" steps", disable=not progress
     ) as bar:
-        while len(trace.objective) < total and not (len(trace.objective) and stop.says(trace)):
-            first, rows = len(trace.objective), []
+        while not search.finished(history):
+            first, rows = len(history.objective), []
             for done in range(first, min(first + _CHUNK, total)):
-                states, row = descend(problem, method, states, weight(done, total))
+                states, row = descend(problem, rule, states, penalty_weight(done, total))
                 rows.append(row)
-            trace = Trace(
+            history = History(
                 *(
                     np.concatenate([old, np.stack(new)])
-                    for old, new in zip(trace, zip(*rows, strict=True), strict=True)
+                    for old, new in zip(history, zip(*rows, strict=True), strict=True)
                 )
             )
-            kept.write(states, trace)
-            best = chosen(states.best)
+            checkpoint.write(states, history)
+            best = best_start(states.best)
             feasible = int(np.sum(np.asarray(states.best.violation) <= 0))
             bar.set_postfix_str(
                 f"objective {float(states.best.objective[best]):.3g}, {feasible} feasible",
                 refresh=False,
             )
             bar.update(len(rows))
-    return states, trace
+    return states, history
 
 
-def _result(problem: Problem, terms: Terms, states: State, trace: Trace) -> Design:
-    best = chosen(states.best)
+def _result(problem: DesignProblem, terms: Terms, states: DescentState, history: History) -> Design:
+    best = best_start(states.best)
     if not np.isfinite(states.best.objective[best]):
         raise ValueError(
-            "design: not one start found an equilibrium, need bounds and inputs for which the "
-            "scene can be solved"
+            "design: no start found an equilibrium, need bounds and inputs for which the scene can "
+            "be solved"
         )
     free = problem.at(states.best.z)
-    found = []
-    for i, (objective, violation) in enumerate(
-        zip(states.best.objective, states.best.violation, strict=True)
-    ):
-        found.append(
-            Start(
-                *terms.placed(jax.tree.map(lambda x, i=i: x[i], free)),
-                float(objective),
-                float(violation),
-            )
+    starts = tuple(
+        Start(
+            *terms.substitute(jax.tree.map(lambda x, i=i: x[i], free)),
+            float(objective),
+            float(violation),
         )
+        for i, (objective, violation) in enumerate(
+            zip(states.best.objective, states.best.violation, strict=True)
+        )
+    )
     margins = [float(x) for x in states.best.margins[best]]
     names = [str(constraint) for constraint in terms.constraints]
-    one = found[best]
+    one = starts[best]
     return Design(
         one.scene,
         one.inputs,
         one.objective,
         one.violation <= 0,
         dict(zip(names, margins, strict=True)),
-        tuple(found),
-        trace,
+        tuple(name for name in (*parameters(one.scene), INPUTS) if name in problem.low),
+        starts,
+        history,
     )

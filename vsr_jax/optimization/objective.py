@@ -1,19 +1,18 @@
-r"""What a design makes small: numbers without unit that look at one scene under several sets of
-inputs.
+r"""Objectives of a design: dimensionless functions of one scene solved for several sets of inputs.
 
-Objectives add up and take factors: `TipError(targets) + 0.1 * Tension(10.0)`. A function of `Arms`
-is one too, in `Measure`.
+Objectives can be added and scaled: `TipError(targets) + 0.1 * Tension(10.0)`. `Measure` makes an
+objective of a function of `Arms`.
 """
 
 from abc import abstractmethod
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, PyTree
 
 from ..analysis.derivatives import compliance
 from ..arm.scene import Scene
@@ -25,7 +24,7 @@ from ..validation import concrete, instance, numbers, on_arm, positive, rigid
 
 
 class Arms(eqx.Module):
-    """A scene solved under several sets of inputs.
+    """A scene solved for several sets of inputs.
 
     **Fields:** `scene`; `inputs`, shape (sets, actuators); `model`; the `outcome` of each set.
     """
@@ -35,31 +34,34 @@ class Arms(eqx.Module):
     model: Model
     outcome: Outcome
 
-    def each(self, function: Callable, *of_each: Any) -> Any:
-        """`function` of the `Equilibrium` of each set, and of what else there is one of for each,
-        with the sets in the first axis."""
+    def each(self, function: Callable, *arrays: Array) -> PyTree:
+        """`jax.vmap` of `function` over the `Equilibrium` of each set, and over the first axis of
+        `arrays`."""
 
-        def one(inputs: Array, outcome: Outcome, *more: Any) -> Any:
+        def one(inputs: Array, outcome: Outcome, *more: Array) -> PyTree:
             return function(Equilibrium(self.scene, inputs, self.model, outcome), *more)
 
-        return jax.vmap(one)(self.inputs, self.outcome, *of_each)
+        return jax.vmap(one)(self.inputs, self.outcome, *arrays)
 
 
 class Objective(eqx.Module):
-    """A number without unit to be made small."""
+    """A dimensionless number to be minimised."""
 
     @abstractmethod
     def __call__(self, arms: Arms) -> Scalar:
         """Its value."""
 
-    def check(self, sets: int, longest: Any) -> None:
-        """Refuses what does not fit as many sets of inputs, or an arm that is no longer than
-        `longest` [m]."""
+    def check(self, sets: int, longest: Scalar) -> None:
+        """Validates the objective for a number of sets of inputs and an arm of at most the length
+        `longest` [m].
+
+        **Raises:** `ValueError` for another number of targets, and for points beyond the arm.
+        """
 
     def __add__(self, other: "Objective") -> "Objective":
         return Sum((self, instance("objective", other, Objective, "another objective to add")))
 
-    def __mul__(self, factor: Any) -> "Objective":
+    def __mul__(self, factor: ArrayLike) -> "Objective":
         return Weighted(numbers("objective's factor", factor), self)
 
     __rmul__ = __mul__
@@ -73,7 +75,7 @@ class Sum(Objective):
     def __call__(self, arms: Arms) -> Scalar:
         return sum((part(arms) for part in self.parts), start=jnp.zeros((), arms.inputs.dtype))
 
-    def check(self, sets: int, longest: Any) -> None:
+    def check(self, sets: int, longest: Scalar) -> None:
         for part in self.parts:
             part.check(sets, longest)
 
@@ -87,13 +89,17 @@ class Weighted(Objective):
     def __call__(self, arms: Arms) -> Scalar:
         return self.factor * self.part(arms)
 
-    def check(self, sets: int, longest: Any) -> None:
+    def check(self, sets: int, longest: Scalar) -> None:
         self.part.check(sets, longest)
 
 
 class Measure(Objective):
-    """Any function of `Arms`, as `Measure(lambda arms: jnp.mean(arms.each(lambda eq: eq.tip[2,
-    3])))`."""
+    """A function of `Arms` as an objective.
+
+        Measure(lambda arms: jnp.mean(arms.each(lambda eq: eq.tip[2, 3])))
+
+    **Arguments:** `function`: of `Arms`, returns a dimensionless number.
+    """
 
     function: Callable = eqx.field(static=True)
 
@@ -102,15 +108,15 @@ class Measure(Objective):
 
 
 class TipError(Objective):
-    r"""Tips at their targets: the mean of $|r_j(L) - r_j^*|^2 / L^2$ over the sets; of poses with
-    the square of the angle [rad] added.
+    r"""Error of the tip: the mean of $|r_j(L) - r_j^*|^2 / L^2$ over the sets; for poses plus the
+    squared angle [rad^2].
 
-    **Arguments:** `targets`: places [m], shape (sets, 3), or poses, shape (sets, 4, 4).
+    **Arguments:** `targets`: positions [m], shape (sets, 3), or poses, shape (sets, 4, 4).
     """
 
     targets: Array
 
-    def __init__(self, targets: Any):
+    def __init__(self, targets: ArrayLike | Sequence):
         self.targets = numbers("TipError.targets", targets, None)
         if self.targets.shape[1:] not in ((3,), (4, 4)):
             raise ValueError(
@@ -121,41 +127,48 @@ class TipError(Objective):
                 rigid(f"TipError.targets[{i}]", pose)
 
     def __call__(self, arms: Arms) -> Scalar:
-        return jnp.mean(arms.each(_missed, self.targets))
+        return jnp.mean(arms.each(_squared_error, self.targets))
 
-    def check(self, sets: int, longest: Any) -> None:
-        _one_a_set("TipError.targets", self.targets, sets)
+    def check(self, sets: int, longest: Scalar) -> None:
+        _check_sets("TipError.targets", self.targets, sets)
 
 
-def _missed(eq: Equilibrium, target: Array) -> Scalar:
-    tip, posed = eq.tip, target.shape == (4, 4)
-    place = target[:3, 3] if posed else target
-    square = jnp.sum((tip[:3, 3] - place) ** 2) / eq.scene.rod.length**2
-    return (
-        square + jnp.sum(rotation_vector(target[:3, :3].T @ tip[:3, :3]) ** 2) if posed else square
-    )
+def _squared_error(eq: Equilibrium, target: Array) -> Scalar:
+    tip, is_pose = eq.tip, target.shape == (4, 4)
+    position = target[:3, 3] if is_pose else target
+    square = jnp.sum((tip[:3, 3] - position) ** 2) / eq.scene.rod.length**2
+    if not is_pose:
+        return square
+    return square + jnp.sum(rotation_vector(target[:3, :3].T @ tip[:3, :3]) ** 2)
 
 
 class CurveError(Objective):
-    r"""Arms along curves: the mean of $|r_j(X_k) - r_{jk}^*|^2 / L^2$ over the sets and points.
+    r"""Error of the axis: the mean of $|r_j(X_k) - r_{jk}^*|^2 / L^2$ over the sets and points.
 
-    A tip does not tell where along the arm it was led astray. With `local` each point counts by $(L
-    / X_k)^4$: a curvature that is wrong moves a point by the square of its distance, so all
-    distances speak alike, and the base is found before the tip. Use it to find a routing from far
-    off; at an exact fit it has the same minimum.
+    With `local` each point has the weight $(L / X_k)^4$. An error of curvature moves a point by the
+    square of its distance from the base, so this weight makes the errors at all distances
+    comparable, and the routing is found from the base towards the tip. Use it for poor initial
+    routings; an exact fit is a minimum of both.
 
     **Arguments:**
-    - `points`: where the axis is wanted [m], shape (points, 3) for all sets or (sets, points, 3).
-    - `X`: abscissas [m] of the points, on the arm; with `local` beyond its base; evenly spaced up
-      to the tip by default, base left out.
-    - `local`: whether points near the base count more.
+    - `points`: target positions of the axis [m], shape (points, 3) for all sets or (sets, points,
+      3).
+    - `X`: abscissas [m] of the points, on the arm, with `local` greater than 0; by default evenly
+      spaced from the base (excluded) to the tip.
+    - `local`: whether to weight points near the base more.
     """
 
     points: Array
     X: Float[Array, " points"] | None
     local: bool = eqx.field(static=True)
 
-    def __init__(self, points: Any, X: Any = None, *, local: bool = False):
+    def __init__(
+        self,
+        points: ArrayLike | Sequence,
+        X: ArrayLike | Sequence | None = None,
+        *,
+        local: bool = False,
+    ):
         self.local = local
         self.points = numbers("CurveError.points", points, None)
         if self.points.ndim not in (2, 3) or self.points.shape[-1] != 3:
@@ -173,15 +186,15 @@ class CurveError(Objective):
         many, length = self.points.shape[-2], arms.scene.rod.length
         X = length * jnp.arange(1, many + 1) / many if self.X is None else self.X
         points = jnp.broadcast_to(self.points, (arms.inputs.shape[0], many, 3))
-        missed = (
-            arms.each(lambda eq, wanted: jnp.sum((eq.position(X) - wanted) ** 2, axis=-1), points)
+        square = (
+            arms.each(lambda eq, target: jnp.sum((eq.position(X) - target) ** 2, axis=-1), points)
             / length**2
         )
-        return jnp.mean(missed * (length / X) ** 4 if self.local else missed)
+        return jnp.mean(square * (length / X) ** 4 if self.local else square)
 
-    def check(self, sets: int, longest: Any) -> None:
+    def check(self, sets: int, longest: Scalar) -> None:
         if self.points.ndim == 3:
-            _one_a_set("CurveError.points", self.points, sets)
+            _check_sets("CurveError.points", self.points, sets)
         if self.X is not None:
             on_arm("CurveError.X", self.X, longest)
 
@@ -190,7 +203,7 @@ class Workspace(Objective):
     r"""A large workspace: $-\frac1{2n} \sum \log(\lambda_i / L^2 + \delta)$ of the n greatest
     eigenvalues of the covariance of the tips.
 
-    **Arguments:** `dimensions`: n, 3 for a volume, 2 for tips that move in a surface, 1 for a line.
+    **Arguments:** `dimensions`: n, 3 for a volume, 2 for tips on a surface, 1 for tips on a line.
     """
 
     dimensions: int = eqx.field(static=True)
@@ -206,31 +219,31 @@ class Workspace(Objective):
         spread = jnp.linalg.eigvalsh(off.T @ off / tips.shape[0])[-self.dimensions :]
         return -0.5 * jnp.mean(jnp.log(spread + jnp.finfo(tips.dtype).eps))
 
-    def check(self, sets: int, longest: Any) -> None:
+    def check(self, sets: int, longest: Scalar) -> None:
         if sets <= self.dimensions:
             raise ValueError(
-                f"Workspace: got {sets} sets of inputs, need more than {self.dimensions} to span "
-                f"so many dimensions"
+                f"Workspace: got {sets} sets of inputs, need more than {self.dimensions}, the "
+                f"dimensions"
             )
 
 
 class TipCompliance(Objective):
-    r"""A stiff tip: $\log \sqrt{\operatorname{tr}(C_F^T C_F)}$ of the displacements $C_F$ [m] by a
-    force of 1 N, the mean over the sets.
+    r"""Compliance of the tip: the mean of $\log \sqrt{\operatorname{tr}(C_F^T C_F)}$ over the sets,
+    where $C_F$ [m] are the displacements for forces of 1 N.
 
-    **Arguments:** `direction`: only forces in this direction [-], a vector in space; any by
+    **Arguments:** `direction`: only forces in this direction [-], shape (3,); all directions by
     default.
     """
 
     direction: Float[Array, "3"] | None
 
-    def __init__(self, direction: Any = None):
+    def __init__(self, direction: ArrayLike | Sequence | None = None):
         self.direction = (
             None if direction is None else numbers("TipCompliance.direction", direction, (3,))
         )
         known = None if self.direction is None else concrete(self.direction)
         if known is not None and not np.any(known):
-            raise ValueError("TipCompliance.direction: got zero, need a vector that is not")
+            raise ValueError("TipCompliance.direction: got zero, need a nonzero vector")
 
     def __call__(self, arms: Arms) -> Scalar:
         moved = arms.each(compliance)[:, 3:, 3:]
@@ -240,7 +253,7 @@ class TipCompliance(Objective):
 
 
 class Tension(Objective):
-    r"""Small forces: the mean of $(\tau_i / \tau_0)^2$ over threads and sets.
+    r"""Thread forces: the mean of $(\tau_i / \tau_0)^2$ over threads and sets.
 
     **Arguments:** `scale`: $\tau_0$ [N].
     """
@@ -254,8 +267,8 @@ class Tension(Objective):
         return jnp.mean((arms.each(lambda eq: eq.forces) / self.scale) ** 2)
 
 
-def _one_a_set(name: str, array: Array, sets: int) -> None:
+def _check_sets(name: str, array: Array, sets: int) -> None:
     if array.shape[0] != sets:
         raise ValueError(
-            f"{name}: got {array.shape[0]} of them for {sets} sets of inputs, need one a set"
+            f"{name}: got {array.shape[0]} of them for {sets} sets of inputs, need one per set"
         )

@@ -1,13 +1,13 @@
-r"""A problem of design: what is free and between which bounds, what is to be least, what is to be
-kept, what is uncertain."""
+"""Formulation of a design problem: free numbers and their bounds, objective, constraints, uncertain
+numbers."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..arm.scene import Scene
@@ -18,20 +18,24 @@ from ..solution.solver import outcome_of
 from ..typing import Scalar, cast
 from ..validation import instance, numbers, positive
 from .constraint import Constraint, Inside
-from .descent import Numbers, Problem
+from .descent import DesignProblem, Numbers
 from .objective import Arms, Measure, Objective
 
 INPUTS = "inputs"
 """Name of the inputs among the free numbers."""
 
 _DRAWS = 8
+"""Scenes over which an uncertain objective is averaged: four draws, each with its opposite."""
+
+Bounds = Sequence[ArrayLike | Sequence] | None
+"""Least and greatest value of a number; None for a phase without bounds."""
 
 
 class Terms(eqx.Module):
-    """Objective and margins as a function of the free numbers, those named `inputs` among them.
+    """Objective and margins as a function of the free numbers, which may include `inputs`.
 
-    `factors`: for each number that is not certain what it may be multiplied by, shape (draws,); the
-    objective is their mean and the margins are kept by all.
+    `factors`: random factors of each uncertain number, shape (draws,). The objective is averaged
+    over the draws, and the margins of all draws count.
     """
 
     scene: Scene
@@ -51,15 +55,15 @@ class Terms(eqx.Module):
         objective, margins = jax.vmap(one)(self.factors)
         return jnp.mean(objective), margins
 
-    def placed(self, free: Numbers) -> tuple[Scene, Array]:
-        """The scene and the inputs with the free numbers in place."""
+    def substitute(self, free: Numbers) -> tuple[Scene, Array]:
+        """The scene and the inputs with the given free numbers."""
         return replaced(
-            self.scene, {name: x for name, x in free.items() if name != "inputs"}
-        ), free.get("inputs", self.inputs)
+            self.scene, {name: x for name, x in free.items() if name != INPUTS}
+        ), free.get(INPUTS, self.inputs)
 
     def arms(self, free: Numbers, factors: Mapping[str, Array]) -> Arms:
-        """The scene solved under every set of inputs."""
-        scene, inputs = self.placed(free)
+        """The scene solved for every set of inputs."""
+        scene, inputs = self.substitute(free)
         known = parameters(scene) if factors else {}
         scene = replaced(
             scene, {name: known[name].value * factor for name, factor in factors.items()}
@@ -69,51 +73,51 @@ class Terms(eqx.Module):
         )
 
 
-def posed(
+def formulate(
     scene: Scene,
-    free: Mapping[str, Any],
+    free: Mapping[str, Bounds],
     objective: Objective | Callable[[Arms], Scalar],
-    inputs: Any,
+    inputs: ArrayLike | Sequence,
     constraints: Sequence[Constraint],
     uncertain: Mapping[str, float],
     model: Model | None,
-) -> tuple[Problem, Terms, Numbers]:
-    """The problem, its terms, and the free numbers as the scene has them; arguments and errors as
+) -> tuple[DesignProblem, Terms, Numbers]:
+    """The problem, its terms, and the free numbers of the initial scene; arguments and errors as
     for `design`."""
     instance("scene", scene, Scene, "a Scene")
     sets = _sets(scene, inputs)
-    wanted = objective if isinstance(objective, Objective) else Measure(_function(objective))
-    kept = tuple(
+    minimised = objective if isinstance(objective, Objective) else Measure(_function(objective))
+    checked = tuple(
         instance(f"constraints[{i}]", one, Constraint, "a Constraint")
         for i, one in enumerate(constraints)
     )
-    kept = kept if any(isinstance(one, Inside) for one in kept) else (Inside(), *kept)
+    inside = () if any(isinstance(one, Inside) for one in checked) else (Inside(),)
     known = {name: parameter.value for name, parameter in parameters(scene).items()} | {
         INPUTS: sets
     }
     low, high = _bounds(free, known)
-    wanted.check(sets.shape[0], high.get("rod.length", scene.rod.length))
+    minimised.check(sets.shape[0], high.get("rod.length", scene.rod.length))
     if INPUTS in low:
         for end in (low[INPUTS], high[INPUTS]):
             for row in np.asarray(end):
                 scene.check_inputs(row)
-    chosen = (
+    solver = (
         StrainDependent()
         if model is None
         else instance("model", model, Model, "StrainDependent(), Prescribed(basis) or Continuum()")
     )
-    terms = Terms(scene, sets, chosen, wanted, kept, _factors(uncertain, known))
+    terms = Terms(scene, sets, solver, minimised, (*inside, *checked), _factors(uncertain, known))
     low, high, terms, given = cast(
         (low, high, terms, {name: known[name] for name in low}), sets.dtype
     )
-    return Problem(low, high, terms), terms, given
+    return DesignProblem(low, high, terms), terms, given
 
 
-def _sets(scene: Scene, inputs: Any) -> Float[Array, "sets inputs"]:
+def _sets(scene: Scene, inputs: ArrayLike | Sequence) -> Float[Array, "sets inputs"]:
     sets = numbers("inputs", inputs, None, finite=False)
     if sets.ndim != 2 or not len(sets):
         raise ValueError(
-            f"inputs: got shape {sets.shape}, need (sets, {len(scene.actuators)}), a row for each "
+            f"inputs: got shape {sets.shape}, need (sets, {len(scene.actuators)}), one row per "
             f"set of inputs"
         )
     for row in sets:
@@ -121,7 +125,7 @@ def _sets(scene: Scene, inputs: Any) -> Float[Array, "sets inputs"]:
     return sets
 
 
-def _function(objective: Any) -> Callable[[Arms], Any]:
+def _function(objective: Callable[[Arms], Scalar]) -> Callable[[Arms], Scalar]:
     if not callable(objective):
         raise ValueError(
             f"objective: got {objective!r}, need an Objective such as TipError or CurveError, or "
@@ -130,42 +134,42 @@ def _function(objective: Any) -> Callable[[Arms], Any]:
     return objective
 
 
-def _bounds(free: Mapping[str, Any], known: Mapping[str, Array]) -> tuple[Numbers, Numbers]:
-    """Least and greatest of every free number by its name."""
+def _bounds(free: Mapping[str, Bounds], known: Mapping[str, Array]) -> tuple[Numbers, Numbers]:
+    """Least and greatest value of every free number by its name."""
     low, high = {}, {}
     for pattern, pair in free.items():
         for name in matching(pattern, known):
             low[name], high[name] = _ends(f"free[{pattern!r}]", pair, name, known[name])
     if not any(np.any(np.asarray(high[name]) > np.asarray(low[name])) for name in low):
         raise ValueError(
-            f"free: got {dict(free)!r}, need at least one number with room between its bounds"
+            f"free: got {dict(free)!r}, need at least one number with different bounds"
         )
     return low, high
 
 
-def _ends(said: str, pair: Any, name: str, value: Array) -> tuple[Array, Array]:
-    """The bounds of a number of that value; infinite for a phase that may turn."""
+def _ends(label: str, pair: Bounds, name: str, value: Array) -> tuple[Array, Array]:
+    """Bounds of a number with the shape of its value; infinite for a phase without bounds."""
     if pair is None and name.endswith(".phase"):
         return jnp.full_like(value, -jnp.inf), jnp.full_like(value, jnp.inf)
     if not isinstance(pair, tuple | list) or len(pair) != 2:
         raise ValueError(
-            f"{said}: got {pair!r}, need a pair, the least and the greatest value (or None for a "
+            f"{label}: got {pair!r}, need a pair, the least and the greatest value (or None for a "
             f"phase)"
         )
-    ends = [numbers(f"{said}[{i}]", end, None) for i, end in enumerate(pair)]
+    ends = [numbers(f"{label}[{i}]", end, None) for i, end in enumerate(pair)]
     for i, end in enumerate(ends):
         if end.shape not in ((), value.shape):
             raise ValueError(
-                f"{said}[{i}]: got shape {end.shape}, need one number or {value.shape}, as {name}"
+                f"{label}[{i}]: got shape {end.shape}, need one number or {value.shape}, as {name}"
             )
     if np.any(np.asarray(ends[0]) > np.asarray(ends[1])):
-        raise ValueError(f"{said}: got {pair!r}, need the least value first")
+        raise ValueError(f"{label}: got {pair!r}, need the least value first")
     low, high = (jnp.broadcast_to(end, value.shape) for end in ends)
     return low, high
 
 
 def _factors(uncertain: Mapping[str, float], known: Mapping[str, Array]) -> dict[str, Array]:
-    """What uncertain numbers may be multiplied by: exp(s n), n normal, each draw with its
+    """Random factors exp(s n) of the uncertain numbers, n standard normal, each draw with its
     opposite."""
     factors, generator = {}, np.random.default_rng(0)
     for pattern, deviation in uncertain.items():

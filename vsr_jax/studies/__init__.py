@@ -1,5 +1,4 @@
-"""Studies of the package itself: the paper's section IV, what each effect costs, what accuracy
-costs.
+"""Studies of the package itself: section IV of the paper, cost of each effect, cost of accuracy.
 
-Users of all that lies above; nothing but the commands imports them.
+They may import every other package except the commands; only the commands import them.
 """

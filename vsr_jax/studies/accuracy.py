@@ -1,17 +1,17 @@
-"""What accuracy costs: errors of tip, strain and gradient of a scene by every model, and the time
-each takes."""
+"""Accuracy against time: errors of tip, strain and gradient of a scene with every model, and times
+per solve."""
 
 import os
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from ..arm.scene import Scene
 from ..models.base import Model
@@ -25,24 +25,25 @@ from ..typing import cast
 from .timing import Timed, take_turns
 
 STEPS = {2: (64,), 4: (8, 32), 6: (4, 8, 16, 32, 64)}
-"""Numbers of steps that are measured, by the steps' order."""
+"""Numbers of steps that are measured, by order."""
 
 TOLERANCES = {1e-3: "1 mm", 1e-6: "1 um", 1e-9: "1 nm"}
-"""Errors [m] for which `advice` names what to use."""
+"""Errors [m] for which `advice` recommends a setting."""
 
 GROUPS = ("steps", "bases", "continuum")
-"""What `settings` may be asked for."""
+"""Groups of `settings`."""
 
 STATIONS, FEW = 41, 8
-"""Stations at which strains are compared, and of how many shapes errors are taken."""
+"""Stations at which strains are compared, and shapes whose errors are computed."""
 
 _SINGLES = 5
+"""Single solves per round: one alone is close to the resolution of the clock."""
 _QUICK = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
-"""For programs that are not timed."""
+"""Compiler options for programs that are not timed."""
 
 
 class Setting(NamedTuple):
-    """A way to solve: its family, what sets it apart there, the model and the precision."""
+    """A model and a precision, with the family and the label under which they are reported."""
 
     family: str
     label: str
@@ -50,13 +51,13 @@ class Setting(NamedTuple):
     dtype: str = "float64"
 
 
-class Row(NamedTuple):
-    """What a setting costs and gives.
+class AccuracyRow(NamedTuple):
+    """Errors and times of a setting.
 
-    - `tip` [m], `strain` [-], `gradient` [-]: the largest errors over the shapes; of strain the
+    - `tip` [m], `strain` [-], `gradient` [-]: largest errors over the shapes: for the strain the
       energy norm $\\sqrt{\\delta \\xi^T \\Sigma \\delta \\xi / \\Sigma_{44}}$, largest over the
-      stations; of gradient the relative one of `plan`. None where a shape was lost.
-    - `single_us`, `batch_us`: medians for one shape, alone and in a batch [us].
+      stations; for the gradient the relative error as in `plan`. None if a shape was not solved.
+    - `single_us`, `batch_us`: median times per shape, single and in a batch [us].
     - `lost`: share of the batch that was not solved.
     """
 
@@ -79,8 +80,8 @@ class Row(NamedTuple):
 def settings(
     scene: Scene, *, groups: Iterable[str] = GROUPS, own: AbstractBasis | None = None
 ) -> list[Setting]:
-    """Settings that span each model's range for a scene; `own`: a basis made for it, measured
-    too."""
+    """Settings that cover the range of each model for a scene; `own`: an additional basis made for
+    it."""
     found: list[Setting] = []
     if "steps" in groups:
         found += [
@@ -119,16 +120,16 @@ def settings(
 
 
 class _Shapes(NamedTuple):
-    """Tip [m], strains at the stations and derivatives of the tip, of a few shapes."""
+    """Tips [m], strains at the stations and derivatives of the tips of a few shapes."""
 
     tip: np.ndarray
     strain: np.ndarray
     slopes: np.ndarray
 
 
-class _Task(NamedTuple):
-    """What a few shapes are computed by: compiled beforehand, since that goes side by side, and
-    running does not."""
+class _ShapeProgram(NamedTuple):
+    """Compiled program for a few shapes. Programs are compiled in parallel and run one after
+    another."""
 
     program: Callable
     inputs: Array
@@ -137,11 +138,11 @@ class _Task(NamedTuple):
         return _Shapes(*(np.asarray(x, float) for x in self.program(self.inputs)))
 
 
-def _task(scene: Scene, inputs: Array, model: Model) -> _Task:
+def _shape_program(scene: Scene, inputs: Array, model: Model) -> _ShapeProgram:
     numbers, rest = eqx.partition(scene, eqx.is_inexact_array)
     X = jnp.linspace(0, 1, STATIONS, dtype=inputs.dtype) * scene.rod.length
 
-    def tip(values: tuple[Any, Array]) -> Array:
+    def tip(values: tuple[PyTree, Array]) -> Array:
         return solve(eqx.combine(values[0], rest), values[1], model=model).tip[:3, 3]
 
     def of(u: Array) -> tuple[Array, Array, Array]:
@@ -154,13 +155,15 @@ def _task(scene: Scene, inputs: Array, model: Model) -> _Task:
         )
 
     options = _QUICK if jax.default_backend() == "cpu" and jax.__version_info__ < (0, 11) else None
-    return _Task(jax.jit(jax.vmap(of)).lower(inputs).compile(compiler_options=options), inputs)
+    return _ShapeProgram(
+        jax.jit(jax.vmap(of)).lower(inputs).compile(compiler_options=options), inputs
+    )
 
 
 def _errors(
     scene: Scene, inputs: Array, found: _Shapes, true: _Shapes
 ) -> tuple[float | None, float | None, float | None]:
-    """Largest error of tip, strain and gradient; None where a shape was lost."""
+    """Largest errors of tip, strain and gradient; None if a shape was not solved."""
     X = np.linspace(0, 1, STATIONS) * float(scene.rod.length)
     stiffness = np.stack(
         [np.broadcast_to(s, X.shape) for s in scene.sections(jnp.asarray(X)).stiffness], axis=-1
@@ -177,64 +180,68 @@ def _errors(
     return float(tip), _known(np.max(strain)), _known(jnp.max(slope))
 
 
-def _known(error: Any) -> float | None:
+def _known(error: np.ndarray | Array) -> float | None:
     return float(error) if np.isfinite(error) else None
 
 
 def measure(
     scene: Scene,
     inputs: Array,
-    ways: Sequence[Setting],
+    measured: Sequence[Setting],
     *,
     reference: Model | None = None,
     rounds: int = 5,
-    say: Callable[[str], Any] = lambda name: None,
-) -> list[Row]:
-    """Errors and times of each setting, all timed in turn.
+    report: Callable[[str], object] = lambda message: None,
+) -> list[AccuracyRow]:
+    """Errors and times of each setting; rounds of timing cover all settings in turn.
 
     **Arguments:**
     - `inputs`: the batch, shape (shapes, inputs), double precision. Errors are those of the first
       eight.
-    - `ways`: what to measure, see `settings`.
-    - `reference`: what errors are taken against; `StrainDependent(256)`, or with loads, lengths or
-      friction `StrainDependent(96)`.
-    - `rounds`: how often everything is timed.
-    - `say`: told the name of each setting when its turn to be compiled has come.
+    - `measured`: settings to measure, see `settings`.
+    - `reference`: model of the reference solution, by default `StrainDependent(256)`; with loads,
+      lengths or friction `StrainDependent(96)`.
+    - `rounds`: number of rounds of timing.
+    - `report`: called with a message before each setting is compiled, and before timing.
     """
     exact = reference or StrainDependent(96 if scene.coupled else 256)
-    true = _task(scene, inputs[:FEW], exact).shapes()
+    true = _shape_program(scene, inputs[:FEW], exact).shapes()
 
-    def prepare(way: Setting) -> tuple[tuple[Timed, Timed], _Task]:
-        say(f"{way.family}, {way.label}, {way.dtype}")
-        dtype = jnp.dtype(way.dtype)
+    def prepare(setting: Setting) -> tuple[tuple[Timed, Timed], _ShapeProgram]:
+        report(f"compiling {setting.family}, {setting.label}, {setting.dtype}")
+        dtype = jnp.dtype(setting.dtype)
         arm, batch = cast(scene, dtype), inputs.astype(dtype)
 
         def tip(u: Array) -> Array:
-            return solve(arm, u, model=way.model).tip[:3, 3]
+            return solve(arm, u, model=setting.model).tip[:3, 3]
 
         jobs = Timed(tip, batch[0], calls=_SINGLES), Timed(jax.vmap(tip), batch)
-        return jobs, _task(arm, batch[:FEW], way.model)
+        return jobs, _shape_program(arm, batch[:FEW], setting.model)
 
-    with ThreadPoolExecutor(os.cpu_count()) as pool:  # while one is traced another compiles
-        prepared = list(pool.map(prepare, ways))
-    errors = [_errors(scene, inputs[:FEW], task.shapes(), true) for _, task in prepared]
-    say("all of them are timed")
+    # one program is traced while another is compiled
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        prepared = list(pool.map(prepare, measured))
+    errors = [_errors(scene, inputs[:FEW], program.shapes(), true) for _, program in prepared]
+    report("timing all settings")
     take_turns([job for jobs, _ in prepared for job in jobs], rounds)
     return [
-        _row(way, jobs, found) for way, (jobs, _), found in zip(ways, prepared, errors, strict=True)
+        _row(setting, jobs, found)
+        for setting, (jobs, _), found in zip(measured, prepared, errors, strict=True)
     ]
 
 
 def _row(
-    way: Setting, jobs: tuple[Timed, Timed], errors: tuple[float | None, float | None, float | None]
-) -> Row:
+    setting: Setting,
+    jobs: tuple[Timed, Timed],
+    errors: tuple[float | None, float | None, float | None],
+) -> AccuracyRow:
     single, batch = (job.summary() for job in jobs)
     tips = np.asarray(jobs[1].output)
     lost = float(np.mean(~np.isfinite(tips[:, 0])))
-    return Row(
-        way.family,
-        way.label,
-        way.dtype,
+    return AccuracyRow(
+        setting.family,
+        setting.label,
+        setting.dtype,
         *errors,
         single["median_us"],
         batch["median_us"] / len(tips),
@@ -243,44 +250,48 @@ def _row(
 
 
 def cheapest(
-    rows: Iterable[Row], limit: float, *, of: str = "tip", by: str = "batch_us"
-) -> Row | None:
-    """The row that takes least of `by` among those whose error `of` is at most `limit`; None if
-    there is none."""
+    rows: Iterable[AccuracyRow], limit: float, *, of: str = "tip", by: str = "batch_us"
+) -> AccuracyRow | None:
+    """The row with the least `by` among those whose error `of` is at most `limit`; None if there is
+    none."""
     fits = [row for row in rows if (error := getattr(row, of)) is not None and error <= limit]
     return min(fits, key=lambda row: getattr(row, by), default=None)
 
 
-def advice(rows: Sequence[Row]) -> list[str]:
-    """What to use for an error of a millimetre, a micrometre and a nanometre, in a batch, alone,
-    and for gradients."""
+def advice(rows: Sequence[AccuracyRow]) -> list[str]:
+    """Recommended settings for errors of 1 mm, 1 um and 1 nm, in a batch and for single solves, and
+    for gradients."""
     text = []
     for limit, name in TOLERANCES.items():
         batch, single = (cheapest(rows, limit, by=by) for by in ("batch_us", "single_us"))
         if batch is None or single is None:
-            text.append(f"for {name}: nothing measured here")
+            text.append(f"for {name}: no measured setting is accurate enough")
             continue
-        alone = "" if single is batch else f"; alone {single.name} ({single.single_us:.0f} us)"
+        alone = "" if single is batch else f"; single {single.name} ({single.single_us:.0f} us)"
         text.append(
-            f"for {name} use {batch.name} ({batch.batch_us:.1f} us a shape in a batch, "
-            f"{batch.single_us:.0f} alone{alone})"
+            f"for {name} use {batch.name} ({batch.batch_us:.1f} us per shape in a batch, "
+            f"{batch.single_us:.0f} us single{alone})"
         )
     slope = cheapest(rows, 0.01, of="gradient")
     text.append(
         "for gradients within 1 %: "
-        + ("nothing measured here" if slope is None else f"{slope.name} ({slope.batch_us:.1f} us)")
+        + (
+            "no measured setting is accurate enough"
+            if slope is None
+            else f"{slope.name} ({slope.batch_us:.1f} us)"
+        )
     )
     return text
 
 
-def table(rows: Iterable[Row]) -> list[str]:
-    """The rows as Markdown."""
+def table(rows: Iterable[AccuracyRow]) -> list[str]:
+    """Lines of a Markdown table."""
 
     def number(value: float | None) -> str:
-        return "lost" if value is None else f"{value:.1e}"
+        return "not solved" if value is None else f"{value:.1e}"
 
     head = [
-        "| model | tip [m] | strain | gradient | one [us] | in a batch [us] |",
+        "| model | tip [m] | strain | gradient | single [us] | per shape in a batch [us] |",
         "| --- |" + " ---: |" * 5,
     ]
     return head + [

@@ -1,22 +1,23 @@
-"""Pictures of what accuracy costs: a panel a scene, a line a family of models."""
+"""Figures of accuracy against time: one panel per scene, one line per family of models."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import matplotlib.pyplot as plt
+from jax.typing import ArrayLike
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator
 
 from ..validation import choice
-from .accuracy import Row
+from .accuracy import AccuracyRow
 
 ERRORS = {
     "tip": "tip error [m]",
     "strain": "strain error [-]",
     "gradient": "relative error of the gradient [-]",
 }
-TIMES = {"batch_us": "time a shape, in a batch [us]", "single_us": "time of one shape [us]"}
+TIMES = {"batch_us": "time per shape in a batch [us]", "single_us": "time of a single solve [us]"}
 
 _STYLES: dict[str, tuple[str, str]] = {
     "steps of order 6": ("#0072B2", "o"),
@@ -30,22 +31,27 @@ _STYLES: dict[str, tuple[str, str]] = {
     "continuum, Kvaerno5": ("#999999", "X"),
 }
 _LEAST = 1e-16
+"""Smallest error that is drawn: a logarithmic axis has no zero."""
+
+
+Curve = tuple[Sequence[float] | ArrayLike, Sequence[float] | ArrayLike]
+"""Times [us] and errors."""
 
 
 def work_precision(
-    rows: Mapping[str, Sequence[Row]],
+    rows: Mapping[str, Sequence[AccuracyRow]],
     *,
     error: str = "tip",
     time: str = "batch_us",
-    others: Mapping[str, Any] | None = None,
+    others: Mapping[str, Mapping[str, Curve]] | None = None,
 ) -> Figure:
-    """Error over time, both logarithmic, a panel a scene; float32 with open markers and a dashed
-    line.
+    """Error against time, both logarithmic, one panel per scene; float32 with open markers and
+    dashed lines.
 
-    **Arguments:** `rows`: by the name of the scene; `error`, `time`: which of each row; `others`:
-    by the name of the scene, pairs of arrays (times [us], errors) of other tools by their names.
+    **Arguments:** `rows`: by name of the scene; `error`, `time`: keys of `ERRORS` and `TIMES`;
+    `others`: for other tools, by name of the scene and name of the tool, (times [us], errors).
 
-    **Raises:** `ValueError` for another error or time.
+    **Raises:** `ValueError` for an unknown error or time.
     """
     choice("error", error, tuple(ERRORS))
     choice("time", time, tuple(TIMES))
@@ -60,7 +66,7 @@ def work_precision(
     )
     for ax in axes.flat[len(rows) :]:
         ax.set_axis_off()
-    handles: dict[str, Any] = {}
+    handles: dict[str, Line2D] = {}
     for ax, (name, some) in zip(axes.flat, rows.items(), strict=False):
         handles |= _panel(ax, some, error, time)
         for place, (tool, (times, errors)) in enumerate(((others or {}).get(name) or {}).items()):
@@ -90,7 +96,7 @@ def work_precision(
     return figure
 
 
-def _panel(ax: Axes, rows: Sequence[Row], error: str, time: str) -> dict[str, Any]:
+def _panel(ax: Axes, rows: Sequence[AccuracyRow], error: str, time: str) -> dict[str, Line2D]:
     handles = {}
     for family, dtype in dict.fromkeys((row.family, row.dtype) for row in rows):
         some = [

@@ -1,12 +1,13 @@
-"""What each effect of a scene costs: one arm to which the effects are added one after another."""
+"""Cost of each effect of a scene: effects are added to one arm, one at a time."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, PyTree
 
 from ..arm.actuator import Tendon
 from ..arm.loads import Gravity, PointWrench, TipWrench
@@ -22,13 +23,13 @@ from ..solution.solver import solve
 from .timing import Timed, take_turns
 
 PULLED, SHORTENED = (4.0, 2.0), (4.0, -0.003)
-"""Inputs: tensions [N] of both tendons; tension of the one and change of length [m] of the
-other."""
+"""Inputs: tensions [N] of both tendons; tension [N] of the first and change of length [m] of the
+second."""
 
 
 class Rung(NamedTuple):
-    """One step of the ladder: its name, the scene, the inputs, and whether the tip's pose is asked
-    for or the strains alone."""
+    """One scene of the ladder: its name, the scene, the inputs, and whether the tip pose is
+    computed or only the strains."""
 
     name: str
     scene: Scene
@@ -37,8 +38,8 @@ class Rung(NamedTuple):
 
 
 class Cost(NamedTuple):
-    """What a rung costs: the scene's effects, operations of the compiled single solve, and
-    summaries of `Timed` for one solve and for a batch."""
+    """Cost of a rung: effects of the scene, operations of the compiled single solve, summaries of
+    `Timed` for a single solve and for a batch, share of the batch that converged."""
 
     name: str
     effects: tuple[str, ...]
@@ -86,19 +87,18 @@ def measure(
     batch_size: int = 256,
     rounds: int = 5,
     model: StrainDependent | None = None,
-    say: Callable[[str], Any] | None = None,
+    report: Callable[[str], object] = lambda message: None,
 ) -> list[Cost]:
-    """Costs of all rungs, timed in turn.
+    """Costs of all rungs; rounds of timing cover all rungs in turn.
 
-    **Arguments:** `batch_size`: shapes in a batch; `rounds`: how often each solve is timed;
-    `model`: 16 steps by default; `say`: is told what is being compiled.
+    **Arguments:** `batch_size`: shapes in a batch; `rounds`: number of rounds of timing;
+    `model`: 16 steps by default; `report`: called with a message before each rung is compiled.
     """
     model = StrainDependent(16) if model is None else model
     scale = np.random.default_rng(0).uniform(0.5, 1.5, (batch_size, 1))
     rungs, jobs = ladder(), []
     for rung in rungs:
-        if say is not None:
-            say(rung.name)
+        report(f"compiling {rung.name}")
         jobs.append(_jobs(rung, model, scale))
     take_turns((job for pair in jobs for job in pair), rounds)
     costs = []
@@ -121,7 +121,7 @@ def measure(
 def _jobs(rung: Rung, model: StrainDependent, scale: np.ndarray) -> tuple[Timed, Timed]:
     values, fixed = eqx.partition(rung.scene, eqx.is_array)
 
-    def one(values: Any, inputs: Any) -> Any:
+    def one(values: PyTree, inputs: Array) -> tuple[PyTree, Array]:
         scene = eqx.combine(values, fixed)
         if not rung.pose:
             outcome = model.solve(scene, inputs)
@@ -136,9 +136,9 @@ def _jobs(rung: Rung, model: StrainDependent, scale: np.ndarray) -> tuple[Timed,
 
 
 def table(costs: Sequence[Cost]) -> list[str]:
-    """Lines of a Markdown table, each number with its ratio to the row above."""
+    """Lines of a Markdown table; each number with its ratio to the row above."""
     lines = [
-        "| scene | operations | compile [s] | single [us] | batch [us a shape] | converged |",
+        "| scene | operations | compile [s] | single [us] | batch [us per shape] | converged |",
         "|" + "---|" * 6,
     ]
     for above, cost in zip((None, *costs), costs, strict=False):

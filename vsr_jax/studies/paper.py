@@ -1,5 +1,5 @@
-"""The paper's scenes A1 to C2 (Tables I and III), its prescribed bases (Tables II and IV, mended)
-and reference solutions.
+"""The paper's scenes A1 to C2 (Tables I and III), its prescribed bases (Tables II and IV,
+corrected) and reference solutions.
 
 Federico Renda, Costanza Armanini, Vincent Lebastard, Fabien Candelier and Frederic Boyer, A
 Geometric Variable-Strain Approach for Static Modeling of Soft Manipulators With Tendon and Fluidic
@@ -33,7 +33,7 @@ CASES = {
     "C1": "cone, three oblique threads",
     "C2": "cone, two helices",
 }
-"""Name of each case and what it is."""
+"""Name and description of each case."""
 
 _HALF = TIP_RADIUS / 2
 _ANGLES = (1.529, 1.487)
@@ -44,9 +44,9 @@ _OBLIQUE = (
 )
 
 
-class Solution(NamedTuple):
-    """A reference solution: forces [N], tip pose, and strain (k, u) and position [m] at stations X
-    [m]; `stability` margin."""
+class ReferenceSolution(NamedTuple):
+    """A reference solution: forces [N], tip pose, strain (k, u) and position [m] at stations X [m],
+    stability margin."""
 
     tau: np.ndarray
     tip: np.ndarray
@@ -67,7 +67,7 @@ def _routings(case: str) -> tuple[Routing, ...]:
 
 
 def scene(case: str) -> Scene:
-    """Scene of a case of Tables I and III: "A1", "A2", "A3", "B1", "B2", "C1" or "C2"; its inputs
+    """Scene of a case of Tables I and III: "A1", "A2", "A3", "B1", "B2", "C1" or "C2". Its inputs
     are the forces tau [N].
 
     **Raises:** `ValueError` for another name.
@@ -79,8 +79,8 @@ def scene(case: str) -> Scene:
 
 
 def basis(case: str) -> Basis:
-    """Prescribed basis of a case, Tables II and IV as mended; C1 and C2 keep the cylinder's, as in
-    the paper."""
+    """Prescribed basis of a case, corrected Tables II and IV; C1 and C2 use the bases of the
+    cylinder, as in the paper."""
     choice("case", case, tuple(CASES))
     constant, linear = Monomial(0), Monomial(1)
     if case == "A1":
@@ -120,12 +120,12 @@ def piecewise_basis() -> Basis:
     return Basis({"bending_z": PiecewiseConstant(3), "elongation": PiecewiseConstant(3)})
 
 
-def reference(case: str) -> list[Solution]:
-    """Reference solutions of a case, made by an independent program; positions hold to 1e-10 m,
-    strains to rounding."""
+def reference(case: str) -> list[ReferenceSolution]:
+    """Reference solutions of a case, computed by an independent program; positions are accurate to
+    1e-10 m, strains to rounding."""
     choice("case", case, tuple(CASES))
     text = files("vsr_jax").joinpath("data", "paper_cases.json").read_text()
     return [
-        Solution(**{k: np.asarray(v) for k, v in entry.items()})
+        ReferenceSolution(**{k: np.asarray(v) for k, v in entry.items()})
         for entry in json.loads(text)["cases"][case]
     ]

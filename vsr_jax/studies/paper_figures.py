@@ -1,14 +1,15 @@
-"""Figures 2 and 3 of the paper, drawn from solved curves: each by its case, its forces tau [N] and
-its model's name."""
+"""Figures 2 and 3 of the paper from samples of solved scenes."""
 
 from collections.abc import Mapping
 from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
+from mpl_toolkits.mplot3d import Axes3D
 
 from ..arm.rod import STRAINS
 from ..solution.summary import Summary
@@ -16,7 +17,7 @@ from ..viz.plot import COLORS, LABELS, arm, equal_scale, shade, strains
 from . import paper
 
 Curves = Mapping[tuple[str, tuple[float, ...], str], Summary]
-"""Curves by (case, tau, model)."""
+"""Samples by case, forces tau [N] and name of the model."""
 
 _FONT: dict[Any, Any] = {
     "font.size": 14,
@@ -32,8 +33,8 @@ _FIG3_TAU = (-15.0,)
 
 
 def _style(model: str, color: str) -> dict[str, Any]:
-    """A wide pale band for the continuum, a thin line over it, and dark dashes over both, so that
-    all three are seen."""
+    """Line style: a wide pale band for the continuum, a thin line over it, and dark dashes over
+    both, so that all three are visible."""
     return {
         "Continuum": {
             "color": color,
@@ -55,8 +56,8 @@ _MODELS = {
 
 
 def figure_2(curves: Curves) -> Figure | None:
-    """Deformed arms and the six strains of every case, one column a case, the three models by line
-    style, or None without any."""
+    """Deformed arms and the six strains of every case, one column per case, the three models by
+    line style; None without curves."""
     cases = [case for case in paper.CASES if any(key[0] == case for key in curves)]
     if not cases:
         return None
@@ -74,11 +75,11 @@ def figure_2(curves: Curves) -> Figure | None:
         )
         grid.update(wspace=0.34, hspace=0.14)
         for column, case in enumerate(cases):
-            chosen = {key: value for key, value in curves.items() if key[0] == case}
-            _head(case, chosen, figure.add_subplot(grid[0, column]))
+            of_case = {key: value for key, value in curves.items() if key[0] == case}
+            _head(case, of_case, figure.add_subplot(grid[0, column]))
             space = figure.add_subplot(grid[1, column], projection="3d")
             panels = [figure.add_subplot(grid[row, column]) for row in range(2, 8)]
-            _draw_case(case, chosen, space, panels)
+            _draw_case(case, of_case, space, panels)
             for panel, name in zip(panels, STRAINS, strict=True):
                 panel.set_ylabel(LABELS[name] if column == 0 else "")
         figure.align_ylabels()
@@ -98,12 +99,12 @@ def figure_2(curves: Curves) -> Figure | None:
 
 
 def _tensions(curves: Curves) -> dict[tuple[float, ...], str]:
-    """The tensions of a case, each with its colour."""
+    """Colour of each set of tensions of a case."""
     return dict(zip(dict.fromkeys(key[1] for key in curves), COLORS, strict=False))
 
 
-def _head(case: str, curves: Curves, ax: Any) -> None:
-    """Name of the case, and the colour of each tension."""
+def _head(case: str, curves: Curves, ax: Axes) -> None:
+    """Name of the case, and a legend of the tensions."""
     ax.axis("off")
     ax.text(
         0.5,
@@ -130,7 +131,7 @@ def _head(case: str, curves: Curves, ax: Any) -> None:
     )
 
 
-def _draw_case(case: str, curves: Curves, space: Any, panels: list[Any]) -> None:
+def _draw_case(case: str, curves: Curves, space: Axes3D, panels: list[Axes]) -> None:
     for name in _MODELS:
         for tau, color in _tensions(curves).items():
             if (case, tau, name) in curves:
@@ -147,9 +148,9 @@ def _draw_case(case: str, curves: Curves, space: Any, panels: list[Any]) -> None
         panel.set_xlabel("X [m]" if panel is panels[-1] else "")
 
 
-def _view(case: str, space: Any) -> None:
-    """Looks along z at the arms that stay in a plane, from aside at the others, and widens the
-    panel to the whole column."""
+def _view(case: str, space: Axes3D) -> None:
+    """Sets the view, along z for planar arms and oblique for the others, and widens the panel to
+    the whole column."""
     left, bottom, width, height = space.get_position().bounds
     space.set_position((left - 0.3 * width, bottom - 0.05 * height, 1.5 * width, 1.25 * height))
     space.patch.set_visible(False)
@@ -171,7 +172,7 @@ def _newtons(tau: tuple[float, ...]) -> str:
 
 
 def figure_3(curves: Curves) -> Figure | None:
-    """A2 at -15 N: shapes and bending of the continuum, the two variable-strain models and PCS, or
+    """Shapes and bending of A2 at -15 N for the continuum, the two variable-strain models and PCS;
     None without A2."""
     styles = {
         "Continuum": ("continuum", _style("Continuum", "#777777")),
@@ -185,19 +186,19 @@ def figure_3(curves: Curves) -> Figure | None:
             {"color": COLORS[2], "linestyle": "-.", "linewidth": 2.0},
         ),
     }
-    chosen = {
+    drawn = {
         name: curves["A2", _FIG3_TAU, name] for name in styles if ("A2", _FIG3_TAU, name) in curves
     }
-    if not chosen:
+    if not drawn:
         return None
     with plt.rc_context(_FONT):
         figure, (plane, bending) = plt.subplots(1, 2, figsize=(13, 5.6), layout="constrained")
-        for name, samples in chosen.items():
+        for name, samples in drawn.items():
             label, style = styles[name]
             x, y, _ = samples.position.T
             plane.plot(x, y, label=label, **style)
             plane.plot(x[-1], y[-1], "o", color=style["color"], markersize=5)
-            # A piecewise-constant strain holds to the next station, where a section begins.
+            # a piecewise-constant strain is constant up to the next station, where a section begins
             strains(
                 samples,
                 bending,

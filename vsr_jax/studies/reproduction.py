@@ -1,5 +1,5 @@
-"""Section IV of the paper run anew: every case, tension and model against the reference solutions,
-as a table and figures."""
+"""Reproduction of section IV of the paper: every case, tension and model against the reference
+solutions, as a table and figures."""
 
 import json
 import os
@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,23 +28,24 @@ from ..viz.plot import sample, sampling
 from . import paper, paper_figures
 
 STATIONS = np.linspace(0.0, paper.LENGTH, 61)
-"""Where strains and poses are taken [m]; every third is a station of the reference solutions."""
+"""Stations [m] of strains and poses; every third is a station of the reference solutions."""
 
 _REPEATS = 5
+"""Warm solves per case, of which the median time is reported."""
 _HEADER = """
 | case | tau [N] | model | DOF | tip [m] | tip error [mm] | tip error [% of L] \
 | strain error [-] | solve [ms] | compile [s] |
 | --- | --- | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |"""
 
 
-class Row(NamedTuple):
+class ReproductionRow(NamedTuple):
     """One solve of a case against its reference solution.
 
     **Fields:** `case`, forces `tau` [N], name of the `model` and its degrees of freedom `dofs`
     (None: infinitely many); `status` in words; `tip` [m] and its error in mm and in percent of the
-    length; `strain_error`, the largest over the reference's stations and over the six strains of
-    |error| / max(1, largest |reference|); `solve_ms`, the median time of a solve and its tip;
-    `compile_s`, None where an earlier solve had compiled the same program.
+    length; `strain_error`, the largest |error| / max(1, largest |reference|) over the stations of
+    the reference and the six strains; `solve_ms`, the median time of a solve with its tip;
+    `compile_s`, None if an earlier solve had compiled the same program.
     """
 
     case: str
@@ -61,20 +62,20 @@ class Row(NamedTuple):
 
     @property
     def converged(self) -> bool:
-        """Whether the solve found an equilibrium."""
+        """Whether the solve converged."""
         return self.status == "converged"
 
 
-class Result(NamedTuple):
-    """A row of the table and the curves of its solution, None where the solve failed."""
+class Comparison(NamedTuple):
+    """A row of the table, and samples of the solution, None if the solve failed."""
 
-    row: Row
+    row: ReproductionRow
     samples: Summary | None
 
 
 def models(case: str) -> dict[str, Model]:
-    """The models that the paper compares on a case, by name; the piecewise-constant one (PCS) on A2
-    alone."""
+    """Models that the paper compares on a case, by name; the piecewise-constant model (PCS) only on
+    A2."""
     compared: dict[str, Model] = {
         "Continuum": Continuum(rtol=1e-10, atol=1e-12),
         "StrainDependent": StrainDependent(),
@@ -83,10 +84,12 @@ def models(case: str) -> dict[str, Model]:
     return compared | ({"PCS": Prescribed(paper.piecewise_basis())} if case == "A2" else {})
 
 
-def compare(cases: Sequence[str] = tuple(paper.CASES), *, progress: bool = True) -> list[Result]:
-    """Solves every tension of `cases` with every model; `progress` shows a bar.
+def compare(
+    cases: Sequence[str] = tuple(paper.CASES), *, progress: bool = True
+) -> list[Comparison]:
+    """Solves every tension of `cases` with every model; `progress` shows a progress bar.
 
-    **Raises:** `ValueError` for a case that `paper.CASES` does not name.
+    **Raises:** `ValueError` for a case that is not in `paper.CASES`.
     """
     _check_cases(cases)
     work = [
@@ -101,9 +104,8 @@ def compare(cases: Sequence[str] = tuple(paper.CASES), *, progress: bool = True)
         for case, _, model, solution in tqdm(work, "solves", disable=not progress)
     ]
     groups = _by_program(solved)
-    with (
-        ThreadPoolExecutor(2) as pool
-    ):  # compiling is most of it; programs that run side by side can wait for each other for ever
+    # two threads, since compiling dominates; more programs that run in parallel could deadlock
+    with ThreadPoolExecutor(2) as pool:
         programs = list(
             tqdm(pool.map(_program, groups), "curves", len(groups), disable=not progress)
         )
@@ -113,7 +115,7 @@ def compare(cases: Sequence[str] = tuple(paper.CASES), *, progress: bool = True)
         for index, curve in _curves(*pair).items()
     }
     return [
-        Result(_row(*item, s, samples[i]), samples[i])
+        Comparison(_row(*item, s, samples[i]), samples[i])
         for i, (item, s) in enumerate(zip(work, solved, strict=True))
     ]
 
@@ -124,8 +126,8 @@ def _check_cases(cases: Sequence[str]) -> None:
 
 
 class _Solved(NamedTuple):
-    """An equilibrium with the median time [s] of a warm solve, that of the first, and whether the
-    first had to compile."""
+    """An equilibrium, its program, the median time [s] of a warm solve, the time of the first
+    solve, and whether that one compiled."""
 
     eq: Equilibrium
     program: Hashable
@@ -134,7 +136,7 @@ class _Solved(NamedTuple):
     fresh: bool
 
 
-def _timed(case: str, model: Model, solution: paper.Solution, seen: set) -> _Solved:
+def _timed(case: str, model: Model, solution: paper.ReferenceSolution, seen: set) -> _Solved:
     scene, inputs = paper.scene(case), jnp.asarray(solution.tau)
 
     def run() -> tuple[Equilibrium, float]:
@@ -152,7 +154,7 @@ def _timed(case: str, model: Model, solution: paper.Solution, seen: set) -> _Sol
 
 
 def _by_program(solved: Sequence[_Solved]) -> list[dict[int, Equilibrium]]:
-    """Equilibria by their place in `solved`, those that share a compiled program together."""
+    """Equilibria by their index in `solved`, grouped by compiled program."""
     groups: dict[Hashable, dict[int, Equilibrium]] = {}
     for index, one in enumerate(solved):
         groups.setdefault(one.program, {})[index] = one.eq
@@ -174,17 +176,17 @@ def _row(
     case: str,
     name: str,
     model: Model,
-    solution: paper.Solution,
+    solution: paper.ReferenceSolution,
     solved: _Solved,
     samples: Summary | None,
-) -> Row:
+) -> ReproductionRow:
     tip = np.asarray(solved.eq.tip)[:3, 3]
     tip_error = float(np.linalg.norm(tip - solution.tip[:3, 3]))
-    return Row(
+    return ReproductionRow(
         case=case,
         tau=tuple(solution.tau.tolist()),
         model=name,
-        dofs=_dofs(model, len(solution.tau)),
+        dofs=model.dofs(solved.eq.scene),
         status=solved.eq.message,
         tip=tuple(tip.tolist()),
         tip_error_mm=1e3 * tip_error,
@@ -195,47 +197,35 @@ def _row(
     )
 
 
-def _dofs(model: Model, threads: int) -> int | None:
-    return (
-        model.basis.size
-        if isinstance(model, Prescribed)
-        else threads
-        if isinstance(model, StrainDependent)
-        else None
-    )
-
-
-def _strain_error(samples: Summary | None, solution: paper.Solution) -> float:
+def _strain_error(samples: Summary | None, solution: paper.ReferenceSolution) -> float:
     if samples is None:
         return float("nan")
     scale = np.maximum(1.0, np.max(np.abs(solution.strain), axis=0))
     return float(np.max(np.abs(samples.strain[::3] - solution.strain) / scale))
 
 
-def table(rows: Sequence[Row]) -> str:
-    """The rows as a Markdown table, headed by what it was measured on and closed by the largest
-    errors of each model."""
-    lines = ["# The paper's cases", "", machine(), _HEADER]
+def table(rows: Sequence[ReproductionRow]) -> str:
+    """The rows as a Markdown table, with the conditions of the run above and the largest errors of
+    each model below."""
+    lines = ["# The paper's cases", "", conditions(), _HEADER]
     lines += ["| " + " | ".join(_cells(row)) + " |" for row in rows]
     return "\n".join([*lines, "", "## Largest errors by model", "", *summary(rows), ""])
 
 
-def machine() -> str:
-    """What the times were measured on, and how to read the table, in words."""
+def conditions() -> str:
+    """Machine and precision of the run, and explanations of the table."""
     device, bits = jax.devices()[0], 64 if jax.config.read("jax_enable_x64") else 32
     return (
         f"Run on {os.cpu_count()} CPU cores ({platform.machine()}), JAX {jax.__version__} on "
         f"{device.platform}, {bits}-bit precision. "
-        f"Times are medians of {_REPEATS} warm calls that solve and take the tip; compile is how "
-        f"much longer the first call took, "
-        "and - where the program had been compiled before. Errors are against the reference "
-        "solutions that the package ships. "
-        "The strain error is the largest over stations and strains of |error| / max(1, largest "
-        "|reference|)."
+        f"Times are medians of {_REPEATS} warm calls that solve and evaluate the tip; compile is "
+        "the additional time of the first call, - if the program had been compiled before. Errors "
+        "are relative to the reference solutions that the package contains. The strain error is "
+        "the largest |error| / max(1, largest |reference|) over stations and strains."
     )
 
 
-def _cells(row: Row) -> tuple[str, ...]:
+def _cells(row: ReproductionRow) -> tuple[str, ...]:
     if not row.converged:
         outcome = (row.status, "-", "-", "-")
     else:
@@ -252,9 +242,8 @@ def _cells(row: Row) -> tuple[str, ...]:
     return (row.case, tau, row.model, dofs, *outcome, f"{row.solve_ms:.2f}", compile_time)
 
 
-def summary(rows: Sequence[Row]) -> list[str]:
-    """One line a model: its largest tip and strain errors with the case of each, and its median
-    solve time."""
+def summary(rows: Sequence[ReproductionRow]) -> list[str]:
+    """One line per model: largest tip and strain errors with their cases, and median solve time."""
     lines = []
     for name in dict.fromkeys(row.model for row in rows):
         solved = [row for row in rows if row.model == name and row.converged]
@@ -279,16 +268,16 @@ def summary(rows: Sequence[Row]) -> list[str]:
 
 def run(
     out: str | Path = "paper", cases: Sequence[str] = tuple(paper.CASES), *, progress: bool = True
-) -> list[Row]:
-    """Runs section IV of the paper and writes `table.md`, `table.json`, Fig. 2 and Fig. 3 (PNG and
-    PDF) to the folder `out`.
+) -> list[ReproductionRow]:
+    """Reproduces section IV of the paper: writes `table.md`, `table.json`, Fig. 2 and Fig. 3 (PNG
+    and PDF) to the folder `out`.
 
-    Fig. 3 shows A2 and is left out where `cases` does not hold it. Precision is that of JAX: set
+    Fig. 3 shows A2 and is omitted if `cases` does not contain it. The precision is that of JAX: set
     `jax_enable_x64` first.
 
     **Returns:** the rows of the table.
 
-    **Raises:** `ValueError` for a case that `paper.CASES` does not name. `OSError` if `out` cannot
+    **Raises:** `ValueError` for a case that is not in `paper.CASES`. `OSError` if `out` cannot
     be written.
     """
     _check_cases(cases)
@@ -298,7 +287,7 @@ def run(
     rows = [result.row for result in results]
     (folder / "table.md").write_text(table(rows), encoding="utf-8")
     document = {
-        "machine": machine(),
+        "machine": conditions(),
         "rows": [{name: _finite(x) for name, x in row._asdict().items()} for row in rows],
     }
     (folder / "table.json").write_text(
@@ -316,8 +305,8 @@ def run(
     return rows
 
 
-def _finite(value: Any) -> Any:
-    """`value` with None for NaN, which JSON has no word for."""
+def _finite(value: object) -> object:
+    """`value` with None in place of NaN, which JSON cannot represent."""
     if isinstance(value, tuple):
         return [_finite(part) for part in value]
     return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -1,30 +1,30 @@
-"""What a function costs: operations, compile time and the times of its warm calls."""
+"""Cost of a function: operations, compile time and times of warm calls."""
 
 import os
 import platform
 import time
 from collections.abc import Callable, Iterable
 from functools import cached_property
-from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
 
 class Timed:
     """A function compiled for its arguments.
 
     **Arguments:**
-    - `function`, `args`: what is compiled and called.
-    - `calls`: how often each `run` calls it.
+    - `function`, `args`: function that is compiled, and its arguments.
+    - `calls`: calls per `run`.
 
     **Attributes:**
-    - `compile_s`: time to trace and compile it [s].
-    - `operations`: floating-point operations of the compiled program, the body of each loop counted
-      once; None if XLA does not say.
+    - `compile_s`: time to trace and compile [s].
+    - `operations`: floating-point operations of the compiled program, each loop body counted once;
+      None if XLA does not report them.
     """
 
-    def __init__(self, function: Callable, *args: Any, calls: int = 1):
+    def __init__(self, function: Callable, *args: PyTree, calls: int = 1):
         start = time.perf_counter()
         self.compiled = jax.jit(function).lower(*args).compile()
         self.compile_s = time.perf_counter() - start
@@ -33,21 +33,21 @@ class Timed:
         self.cpu_samples: list[float] = []
 
     @cached_property
-    def output(self) -> Any:
-        """What the first call returned. That is made when first asked for, and not in the
-        constructor: programs may be compiled side by side, but two that run so from two threads can
-        wait for each other for ever on a CPU."""
+    def output(self) -> PyTree:
+        """Result of the first call. It is made on first access and not in the constructor: programs
+        can be compiled in parallel, but programs that run from two threads can deadlock on a
+        CPU."""
         return jax.block_until_ready(self.compiled(*self.args))
 
     @property
     def operations(self) -> int | None:
-        """Floating-point operations of the compiled program, the body of each loop counted once."""
+        """Floating-point operations of the compiled program, each loop body counted once."""
         costs = self.compiled.cost_analysis()
         return int(costs["flops"]) if isinstance(costs, dict) and "flops" in costs else None
 
     def run(self) -> None:
-        """Calls it and notes the times [us], by the clock and on the CPUs; the very first call is
-        not among them."""
+        """Calls the function and records wall and CPU times [us]; the first call of all is not
+        recorded."""
         _ = self.output
         for _ in range(self.calls):
             start, cpu = time.perf_counter(), time.process_time()
@@ -56,8 +56,8 @@ class Timed:
             self.cpu_samples.append(1e6 * (time.process_time() - cpu))
 
     def summary(self) -> dict[str, float]:
-        """Compile time [s], median and spread (10 to 90 %) of the warm calls [us], and the median
-        of their CPU time [us]."""
+        """Compile time [s]; median, 10 % and 90 % quantiles of the wall times [us]; median of the
+        CPU times [us]."""
         low, median, high = (float(x) for x in np.quantile(self.samples, [0.1, 0.5, 0.9]))
         cpu = float(np.median(self.cpu_samples))
         return {
@@ -70,13 +70,13 @@ class Timed:
 
 
 def machine() -> str:
-    """The machine in words: architecture, cores and device."""
+    """Description of the machine: architecture, cores and device."""
     return f"{platform.machine()}, {os.cpu_count()} cores, {jax.devices()[0].device_kind}"
 
 
 def take_turns(jobs: Iterable[Timed], rounds: int) -> None:
-    """Runs all jobs in turn, round after round, so that a busy machine is busy for all of them
-    alike."""
+    """Runs all jobs in turn, round after round, so that other load on the machine affects all of
+    them equally."""
     jobs = list(jobs)
     for _ in range(rounds):
         for job in jobs:

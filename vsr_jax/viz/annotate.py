@@ -1,25 +1,27 @@
-"""What is drawn onto an arm in space: frames of its sections, arrows of its loads, ellipsoids of
-its tip. After `plot.arm`."""
-
-from typing import Any
+"""Annotations of an arm in 3D, drawn after `plot.arm`: frames of sections, arrows of loads,
+ellipsoids of the tip."""
 
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.typing import ColorType
+from mpl_toolkits.mplot3d import Axes3D
 
 from ..analysis.derivatives import Ellipsoid
 from ..solution.equilibrium import Equilibrium
 from .plot import COLORS, equal_scale
 
 _SHARE = 0.08
-"""Length of what is drawn, as a share of the arm's."""
+"""Length of the axes of a frame relative to the arm; load arrows are twice as long."""
 
 
-def frames(eq: Equilibrium, ax: Any = None, *, stations: int = 6, size: float | None = None) -> Any:
-    """Axes of sections along the arm: x, along it, then y and z, in three colours.
+def frames(
+    eq: Equilibrium, ax: Axes3D | None = None, *, stations: int = 6, size: float | None = None
+) -> Axes3D:
+    """Frames of sections along the arm: x along the arm, y and z, in three colours.
 
-    **Arguments:** `ax`: 3D axes, new ones by default; `stations`: how many sections; `size`: length
-    of the axes [m].
+    **Arguments:** `ax`: 3D axes, new ones by default; `stations`: number of sections; `size`:
+    length of the axes [m].
 
     **Returns:** the axes.
     """
@@ -39,9 +41,8 @@ def frames(eq: Equilibrium, ax: Any = None, *, stations: int = 6, size: float | 
     return ax
 
 
-def loads(eq: Equilibrium, ax: Any = None, *, color: Any = COLORS[1]) -> Any:
-    """Forces of the loads as arrows, at points and along the arm; the longest is a sixth of the
-    arm.
+def loads(eq: Equilibrium, ax: Axes3D | None = None, *, color: ColorType = COLORS[1]) -> Axes3D:
+    """Forces of the loads as arrows, at points and along the arm; the longest is 16 % of the arm.
 
     **Arguments:** `ax`: 3D axes, new ones by default; `color`: of the arrows.
 
@@ -61,13 +62,13 @@ def loads(eq: Equilibrium, ax: Any = None, *, color: Any = COLORS[1]) -> Any:
             ends = here + 2 * _SHARE * length / longest * force
             ax.auto_scale_xyz(
                 *ends.T, had_data=True
-            )  # else the limits are those of these ends alone
+            )  # without had_data the limits would contain only these ends
     equal_scale(ax)
     return ax
 
 
 def _forces(eq: Equilibrium, length: float) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Places [m] and forces in the world's axes: those at points, those along the arm by length."""
+    """Positions [m] and forces in the world's axes: point forces, then densities along the arm."""
     found = []
     for frame in ("world", "body"):
         points = eq.scene.point_wrenches(frame)
@@ -97,16 +98,15 @@ def _forces(eq: Equilibrium, length: float) -> list[tuple[np.ndarray, np.ndarray
 
 def ellipsoid(
     shape: Ellipsoid,
-    ax: Any = None,
+    ax: Axes3D | None = None,
     *,
     scale: float = 1.0,
-    color: Any = COLORS[2],
+    color: ColorType = COLORS[2],
     alpha: float = 0.3,
-) -> Any:
-    """An ellipsoid in space, as `manipulability` and `compliance_ellipsoid` make them.
+) -> Axes3D:
+    """An ellipsoid in space, as returned by `manipulability` and `compliance_ellipsoid`.
 
-    **Arguments:** `ax`: 3D axes, new ones by default; `scale`: by which its half axes are drawn
-    longer.
+    **Arguments:** `ax`: 3D axes, new ones by default; `scale`: factor on the semi-axes.
 
     **Returns:** the axes.
     """
@@ -121,7 +121,7 @@ def ellipsoid(
     return ax
 
 
-def _axes(ax: Any) -> Any:
+def _axes(ax: Axes3D | None) -> Axes3D:
     if ax is None:
         ax = plt.figure(figsize=(6, 5)).add_subplot(projection="3d")
         ax.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
