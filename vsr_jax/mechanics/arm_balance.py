@@ -23,7 +23,7 @@ from ..arm.scene import CrossSections, Scene, shared
 from ..numerics import component as c
 from ..numerics.component import Vector
 from ..numerics.quadrature import Grid
-from .balance import chosen, residual, thread_direction, thread_wrench
+from .balance import chosen, residual, thread_direction, thread_wrench, without_force
 from .cable import Cable, cable_of, path_length
 from .friction import (
     Friction,
@@ -52,6 +52,13 @@ class Problem(NamedTuple):
     def with_share(self, share: Array) -> "Problem":
         """The problem with a share of its loads."""
         return self if self.loads is None else self._replace(loads=self.loads.scaled(share))
+
+    def at_rest(self) -> "Problem":
+        """The problem without loads and forces and with slack cables, so that its solution is the
+        rest strain."""
+        cables = tuple(cable._replace(length=2 * cable.length) for cable in self.cables)
+        loads = None if self.loads is None else self.loads.absent()
+        return self._replace(forces=without_force(self.forces), cables=cables, loads=loads)
 
 
 class Kind(NamedTuple):
@@ -115,30 +122,6 @@ def with_tensions(forces: Vector, tensions: Iterable[Array], kind: Kind) -> Vect
     for place, tension in zip(kind.cables, tensions, strict=True):
         found[place] = -tension
     return tuple(found)
-
-
-def harmless(problem: Problem, sound: Array) -> Problem:
-    """The problem where its solution is sound, and elsewhere one that is at rest: no loads and
-    forces, slack cables."""
-    forces = tuple(jnp.where(sound, f, 0.0) for f in problem.forces)
-    cables = tuple(
-        cable._replace(length=jnp.where(sound, cable.length, 2 * cable.length))
-        for cable in problem.cables
-    )
-    loads = problem.loads
-    if loads is not None:
-        dead, density, follower = (_where(sound, part) for part in loads[:3])
-        points = tuple(
-            point._replace(wrench=_where(sound, point.wrench)) for point in loads.follower_points
-        )
-        loads = loads._replace(
-            dead=dead, dead_density=density, follower_density=follower, follower_points=points
-        )
-    return problem._replace(forces=forces, cables=cables, loads=loads)
-
-
-def _where(sound: Array, wrench: Vector | None) -> Vector | None:
-    return None if wrench is None else tuple(jnp.where(sound, x, 0.0) for x in wrench)
 
 
 def state_of(unknown: Unknown, problem: Problem, kind: Kind) -> State:

@@ -12,8 +12,8 @@ from ..arm.scene import CrossSections
 from ..numerics import component as c
 from ..numerics.batching import arms_in, side_by_side
 from ..numerics.component import Vector
-from ..numerics.implicit import change_of, no_derivative
-from ..numerics.newton import LOAD_SHARES, MOST_TURN, Damped, Solution, damped_newton
+from ..numerics.implicit import implicit_root
+from ..numerics.newton import LOAD_SHARES, MOST_TURN, Damped, Root, damped_newton
 from ..numerics.quadrature import Grid
 from ..typing import cast
 from .arm_balance import (
@@ -22,7 +22,6 @@ from .arm_balance import (
     Problem,
     State,
     Unknown,
-    harmless,
     imbalance_of,
     pull_of,
     rounding_of,
@@ -32,64 +31,39 @@ from .arm_balance import (
     with_tensions,
 )
 from .arm_tangent import approximate_solve, tangent_solve
-from .balance import chosen, solve_balance, spread, with_locked
+from .balance import chosen, completed, solve_balance, spread, with_locked
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(1,))
-def solve_arm(problem: Problem, kind: Kind) -> Solution:
-    """Equilibrium of the arm, from the balance without loads and with slack cables.
+def solve_arm(problem: Problem, kind: Kind) -> Root:
+    """Equilibrium of the arm, from the balance without loads and with slack cables. Its point is an
+    `Unknown`.
 
     Derivatives are implicit, of any order, in forward and reverse mode: the exact tangent is solved
     by refining `approximate_solve`.
     """
-    return side_by_side(partial(_solve, kind))(_start(problem, kind), problem)
 
+    def find(problem: Problem) -> Root:
+        root = side_by_side(partial(_solve, kind))(_start(problem, kind), problem)
+        return root._replace(x=root.x._replace(xi=chosen(root.x.xi, kind.free)))
 
-@partial(solve_arm.defjvp, symbolic_zeros=True)
-def _solve_arm_jvp(
-    kind: Kind, primals: tuple[Problem], tangents: tuple[Problem]
-) -> tuple[Solution, Solution]:
-    solution = solve_arm(primals[0], kind)
-    # Where nothing was found there is no derivative: take it at rest without loads and forces,
-    # where it is finite.
-    sound = solution.balanced & solution.definite
+    def whole(x: Unknown, problem: Problem) -> Unknown:
+        return x._replace(xi=completed(x.xi, problem.sections.rest, kind.free))
 
-    def placed(change: Imbalance, problem: Problem) -> Unknown:
-        """Unknowns at the solution plus a change of those that are solved for; locked strains are
-        those of the rod at rest."""
-        rest = problem.sections.rest
-        xi = tuple(
-            jnp.where(sound, x, jnp.broadcast_to(r, x.shape))
-            for x, r in zip(solution.unknown.xi, rest, strict=True)
-        )
-        xi = with_locked(c.add(xi, spread(change.wrench, kind.free)), rest, kind.free)
-        others = (tuple(jnp.where(sound, x, 0.0) for x in part) for part in solution.unknown[1:])
-        tension, turning = (c.add(x, dx) for x, dx in zip(others, change[1:], strict=True))
-        return Unknown(xi, tension, turning)
-
-    def imbalance(change: Imbalance, problem: Problem) -> Imbalance:
-        unknown, problem = placed(change, problem), harmless(problem, sound)
+    def imbalance(x: Unknown, problem: Problem) -> Imbalance:
+        unknown = whole(x, problem)
         return imbalance_of(unknown, state_of(unknown, problem, kind), problem, kind)
 
-    free, others = chosen(solution.unknown.xi, kind.free), solution.unknown[1:]
-    still = jax.tree.map(jnp.zeros_like, Imbalance(free, *others))
-    right = change_of(lambda problem: imbalance(still, problem), primals, tangents)
-    change = tangent_solve(
-        lambda change: imbalance(change, primals[0]),
-        placed(still, primals[0]),
-        harmless(primals[0], sound),
-        right,
-        kind,
-    )
-    # the rods' own rest strain moves the locked strains
-    locked = change_of(lambda problem: placed(still, problem).xi, primals, tangents)
-    moved = spread(c.scale(-1.0, change.wrench), kind.free)
-    d_unknown = Unknown(
-        with_locked(moved, locked, kind.free),
-        c.scale(-1.0, change.cable),
-        c.scale(-1.0, change.turning),
-    )
-    return solution, Solution(d_unknown, *no_derivative(*solution[1:]))
+    def linear_solve(x: Unknown, problem: Problem, right: Imbalance) -> Unknown:
+        _, apply = jax.linearize(lambda x: imbalance(x, problem), x)
+        return tangent_solve(apply, whole(x, problem), problem, right, kind)
+
+    def at_rest(x: Unknown, problem: Problem) -> tuple[Unknown, Problem]:
+        zero = jax.tree.map(jnp.zeros_like, x)
+        rest = chosen(problem.sections.rest, kind.free)
+        return zero._replace(xi=rest), problem.at_rest()
+
+    root = implicit_root(find, imbalance, linear_solve, at_rest, problem)
+    return root._replace(x=whole(root.x, problem))
 
 
 def _start(problem: Problem, kind: Kind) -> Unknown:
@@ -170,7 +144,7 @@ class _Sizes(NamedTuple):
         return jnp.max(jnp.abs(x), axis=self._inner(x))
 
 
-def _solve(kind: Kind, start: Unknown, whole: Problem) -> Solution:
+def _solve(kind: Kind, start: Unknown, whole: Problem) -> Root:
     arms = arms_in((start, whole), whole.grid.h.ndim - 1)
     start = jax.tree.map(
         lambda x: jnp.broadcast_to(x, (*x.shape[: x.ndim - len(arms)], *arms)), start

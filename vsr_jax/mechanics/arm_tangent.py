@@ -115,10 +115,10 @@ def _tensions(
 
 
 def tangent_solve(
-    imbalance: Callable, unknown: Unknown, problem: Problem, right: Imbalance, kind: Kind
-) -> Imbalance:
+    apply: Callable, unknown: Unknown, problem: Problem, right: Imbalance, kind: Kind
+) -> Unknown:
     r"""Solution of the exact tangent system $A x = b$, with `approximate_solve` as preconditioner;
-    NaN where it is not found.
+    NaN where it is not found. Of the strains the free ones only.
 
     Everything is scaled by energies: a change of strain $\delta\xi$ becomes $\sqrt{\Sigma
     w}\,\delta\xi$, a wrench $\sqrt{w / \Sigma}\,r$, with the weight w of its node, and tensions and
@@ -126,25 +126,23 @@ def tangent_solve(
     where these have a potential, and its transpose is of the same kind. So one norm serves both
     modes of differentiation.
     """
-    still = jax.tree.map(jnp.zeros_like, right)
-    _, matvec = jax.linearize(imbalance, still)
     at = state_of(unknown, problem, kind)
-    to_row, to_change = lax.stop_gradient(_units(problem, kind, still))
-    _, unravel = ravel_pytree(still)
+    flat, unravel_row = ravel_pytree(right)
+    _, unravel_change = ravel_pytree(_free_part(unknown, kind))
+    to_row, to_change = lax.stop_gradient(_units(problem, kind, right))
 
-    def nearly(b: Imbalance) -> Imbalance:
+    def nearly(b: Imbalance) -> Unknown:
         step, _ = approximate_solve(unknown, at, b, problem, kind)
-        step = cast(step, problem.grid.h.dtype)
-        return Imbalance(chosen(step.xi, kind.free), step.tension, step.turning)
+        return _free_part(cast(step, problem.grid.h.dtype), kind)
 
     def scaled_apply(x: Array) -> Array:
-        return to_row * ravel_pytree(matvec(unravel(to_change * x)))[0]
+        return to_row * ravel_pytree(apply(unravel_change(to_change * x)))[0]
 
     def scaled_nearly(b: Array) -> Array:
-        return ravel_pytree(nearly(unravel(b / to_row)))[0] / to_change
+        return ravel_pytree(nearly(unravel_row(b / to_row)))[0] / to_change
 
     # what does not depend on the right side is done once, before the loop
-    b = to_row * ravel_pytree(right)[0]
+    b = to_row * flat
     _, forward = jax.linearize(scaled_nearly, jnp.zeros_like(b))
     back = jax.linear_transpose(forward, b)
 
@@ -154,7 +152,13 @@ def tangent_solve(
     def transpose_solve(apply: Callable, b: Array) -> Array:
         return _refined(apply, lambda r: back(r)[0], b)
 
-    return unravel(to_change * lax.custom_linear_solve(scaled_apply, b, solve, transpose_solve))
+    return unravel_change(
+        to_change * lax.custom_linear_solve(scaled_apply, b, solve, transpose_solve)
+    )
+
+
+def _free_part(unknown: Unknown, kind: Kind) -> Unknown:
+    return unknown._replace(xi=chosen(unknown.xi, kind.free))
 
 
 def _units(problem: Problem, kind: Kind, like: Imbalance) -> tuple[Array, Array]:

@@ -24,7 +24,6 @@ with $P = [-\tilde d, 1]$, is symmetric. Symbols, each a tuple of component arra
 from functools import partial
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -42,8 +41,8 @@ from ..numerics.component import (
     single,
     subtract,
 )
-from ..numerics.implicit import change_of, instantiated, no_derivative
-from ..numerics.newton import Evaluation, newton
+from ..numerics.implicit import implicit_root
+from ..numerics.newton import Evaluation, Root, newton
 
 ALL = tuple(range(6))
 """Places of all strains."""
@@ -137,6 +136,11 @@ def forces_where(sound: Array, tau: Vector) -> Vector:
     return tuple(jnp.where(sound, force, 0.0) for force in tau)
 
 
+def without_force(tau: Vector) -> Vector:
+    """Forces of zero in place of `tau`."""
+    return tuple(jnp.zeros_like(force) for force in tau)
+
+
 def chosen(vector: Vector, free: tuple[int, ...]) -> Vector:
     """Components of the free strains."""
     return tuple(vector[i] for i in free)
@@ -151,6 +155,17 @@ def spread(vector: Vector, free: tuple[int, ...]) -> Vector:
     """Six components from those of the free strains, zero elsewhere."""
     return tuple(
         vector[free.index(i)] if i in free else jnp.zeros_like(vector[0]) for i in range(6)
+    )
+
+
+def completed(free_part: Vector, locked: Vector, free: tuple[int, ...]) -> Vector:
+    """Six strains from the free ones, with the others from `locked`."""
+    one = free_part[0]
+    return tuple(
+        free_part[free.index(i)]
+        if i in free
+        else jnp.broadcast_to(locked[i], one.shape).astype(one.dtype)
+        for i in range(6)
     )
 
 
@@ -177,7 +192,6 @@ def newton_step(
     return r, tuple(s.astype(x.dtype) for s, x in zip(step, r, strict=True))
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(3,))
 def solve_balance(
     sections: CrossSections,
     tau: Vector,
@@ -197,6 +211,46 @@ def solve_balance(
 
     **Returns:** a `Balance`. `xi` is the last iterate whether or not it is balanced.
     """
+
+    def imbalance(
+        x: Vector, sections: CrossSections, tau: Vector, reaction: Vector | None, _: Vector | None
+    ) -> Vector:
+        return chosen(residual(completed(x, sections.rest, free), sections, tau, reaction), free)
+
+    def linear_solve(
+        x: Vector, sections: CrossSections, tau: Vector, *others: Vector | None
+    ) -> Vector:
+        *_, right = others
+        assert right is not None
+        lower = tangent(completed(x, sections.rest, free), sections, tau)
+        return cholesky_solve(cholesky(chosen_rows(lower, free)), right)
+
+    def at_rest(x: Vector, sections: CrossSections, tau: Vector, *others: Vector | None) -> tuple:
+        return chosen(sections.rest, free), sections, without_force(tau), *others
+
+    root = implicit_root(
+        partial(_find_balance, free),
+        imbalance,
+        linear_solve,
+        at_rest,
+        sections,
+        tau,
+        reaction,
+        start,
+    )
+    return Balance(
+        completed(root.x, sections.rest, free), root.converged, root.definite, root.steps
+    )
+
+
+def _find_balance(
+    free: tuple[int, ...],
+    sections: CrossSections,
+    tau: Vector,
+    reaction: Vector | None,
+    start: Vector | None,
+) -> Root:
+    """The free strains of `solve_balance`."""
     stiffness = sections.stiffness
     shape = jnp.broadcast_shapes(
         *(x.shape for x in (*stiffness, *sections.rest, *tau, *(reaction or ())))
@@ -219,33 +273,5 @@ def solve_balance(
     first = rest if start is None else with_locked(start, rest, free)
     xi, definite, steps = newton(evaluate, first, floor)
     imbalance = spread(chosen(residual(xi, sections, tau, reaction), free), free)
-    return Balance(xi, strain_norm(imbalance, stiffness) <= 16 * floor, definite, steps)
-
-
-@partial(solve_balance.defjvp, symbolic_zeros=True)
-def _solve_balance_jvp(
-    free: tuple[int, ...], primals: tuple, tangents: tuple
-) -> tuple[Balance, Balance]:
-    sections, tau, reaction, start = primals
-    solution = solve_balance(sections, tau, reaction, free, start)
-    # Where nothing was balanced there is no derivative: take it at rest without forces, where it is
-    # finite, so that no other lane of a batch is harmed.
-    sound = solution.balanced & solution.definite
-    xi = tuple(
-        jnp.where(sound, x, rest) for x, rest in zip(solution.xi, sections.rest, strict=True)
-    )
-
-    def imbalance(
-        sections: CrossSections, tau: Vector, reaction: Vector | None, _: Vector | None
-    ) -> Vector:
-        return residual(
-            with_locked(xi, sections.rest, free), sections, forces_where(sound, tau), reaction
-        )
-
-    change = change_of(imbalance, primals, tangents)
-    factor = cholesky(chosen_rows(tangent(xi, sections, forces_where(sound, tau)), free))
-    change = spread(scale(-1.0, cholesky_solve(factor, chosen(change, free))), free)
-    return solution, Balance(
-        with_locked(change, instantiated(tangents[0].rest, sections.rest), free),
-        *no_derivative(*solution[1:]),
-    )
+    balanced = strain_norm(imbalance, stiffness) <= 16 * floor
+    return Root(chosen(xi, free), balanced, definite, steps)

@@ -11,8 +11,10 @@ depends on the shape through rotations only, so positions are never needed. Wren
 ends of steps only.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
@@ -66,13 +68,24 @@ class Loading(NamedTuple):
 
     def scaled(self, share: Array) -> "Loading":
         """A share of all loads."""
-        dead, dead_density, follower_density = (
-            None if part is None else c.scale(share, part) for part in self[:3]
-        )
+        return self._mapped(lambda x: share * x)
+
+    def absent(self) -> "Loading":
+        """Zero in place of all loads."""
+        return self._mapped(jnp.zeros_like)
+
+    def _mapped(self, function: Callable[[Array], Array]) -> "Loading":
+        """A function of every component of the loads."""
         points = tuple(
-            point._replace(wrench=c.scale(share, point.wrench)) for point in self.follower_points
+            point._replace(wrench=jax.tree.map(function, point.wrench))
+            for point in self.follower_points
         )
-        return Loading(dead, dead_density, follower_density, points, self.base)
+        return self._replace(
+            dead=jax.tree.map(function, self.dead),
+            dead_density=jax.tree.map(function, self.dead_density),
+            follower_density=jax.tree.map(function, self.follower_density),
+            follower_points=points,
+        )
 
 
 class Reaction(NamedTuple):

@@ -1,7 +1,6 @@
 r"""The model with a prescribed basis (eq. 14-18): $K q = B(q) \tau$ by Gauss quadrature and
 Newton's method."""
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -18,12 +17,13 @@ from ..mechanics.balance import (
     tangent,
     thread_direction,
     thread_wrench,
+    without_force,
 )
 from ..numerics import component as c, lu
 from ..numerics.component import Vector
-from ..numerics.implicit import change_of, no_derivative
+from ..numerics.implicit import implicit_root
 from ..numerics.magnus import ORDERS, accumulate_jacobian
-from ..numerics.newton import Evaluation, newton
+from ..numerics.newton import Evaluation, Root, newton
 from ..numerics.quadrature import Grid, make_grid, onto
 from ..typing import Scalar
 from ..validation import ROUNDING, choice, count, instance, on_arm
@@ -70,16 +70,29 @@ def project(scene: Scene, basis: AbstractBasis, points: int) -> Projection:
     return Projection(scene.sections(X), grid.weight.reshape(-1), matrix)
 
 
-@jax.custom_jvp
-def solve_projected(
-    projection: Projection, tau: Vector
-) -> tuple[Float[Array, " dofs"], Array, Array, Array]:
+def solve_projected(projection: Projection, tau: Vector) -> Root:
     r"""Coordinates q with $K q = B(q) \tau$ (eq. 18), by Newton's method on the symmetric tangent
-    $K - \partial (B \tau) / \partial q$.
+    $K - \partial (B \tau) / \partial q$. Derivatives of any order are implicit."""
 
-    **Returns:** q, whether the residual is balanced, whether the tangent is positive definite, and
-    the Newton steps. Derivatives of any order are implicit.
-    """
+    def linear_solve(q: Array, projection: Projection, tau: Vector, right: Array) -> Array:
+        return lu.solve(_tangent(q, projection, tau), right)
+
+    def at_rest(q: Array, projection: Projection, tau: Vector) -> tuple:
+        return jnp.zeros_like(q), projection, without_force(tau)
+
+    return implicit_root(_find_projected, _imbalance, linear_solve, at_rest, projection, tau)
+
+
+def _imbalance(q: Array, projection: Projection, tau: Vector) -> Array:
+    """$K q - B(q) \\tau$."""
+    return projection.integrate(residual(projection.strain(q), projection.sections, tau))
+
+
+def _tangent(q: Array, projection: Projection, tau: Vector) -> Array:
+    return projection.stiffness(tangent(projection.strain(q), projection.sections, tau))
+
+
+def _find_projected(projection: Projection, tau: Vector) -> Root:
     K = projection.elastic_stiffness()
     elastic = lu.factor(K)
     axial = jnp.sum(projection.weight * projection.sections.stiffness[3])
@@ -87,44 +100,17 @@ def solve_projected(
     def norm(force: Array, change: Array) -> Array:
         return jnp.sqrt(jnp.maximum(force @ change, 0.0) / axial)
 
-    def imbalance(q: Array) -> Array:
-        return projection.integrate(residual(projection.strain(q), projection.sections, tau))
-
     def evaluate(q: Array) -> Evaluation:
-        r = imbalance(q)
-        factors = lu.factor(
-            projection.stiffness(tangent(projection.strain(q), projection.sections, tau))
-        )
+        r = _imbalance(q, projection, tau)
+        factors = lu.factor(_tangent(q, projection, tau))
         definite, relaxed = jnp.all(lu.diagonal(factors) > 0), lu.substitute(elastic, r)
         step = jnp.where(definite, lu.substitute(factors, r), relaxed)
         return Evaluation(step, norm(K @ step, step), norm(r, relaxed), definite)
 
     floor = jnp.max(rounding_floor(projection.sections.stiffness, tau)) * K.shape[0] ** 0.5
     q, definite, steps = newton(evaluate, jnp.zeros(K.shape[0], K.dtype), floor)
-    left = imbalance(q)
-    return q, norm(left, lu.substitute(elastic, left)) <= 16 * floor, definite, steps
-
-
-@partial(solve_projected.defjvp, symbolic_zeros=True)
-def _solve_projected_jvp(primals: tuple, tangents: tuple) -> tuple:
-    projection, tau = primals
-    q, balanced, definite, steps = solve_projected(projection, tau)
-    sound = balanced & definite
-    q_sound = jnp.where(sound, q, 0.0)
-
-    def imbalance(projection: Projection, tau: Vector) -> Array:
-        return projection.integrate(
-            residual(projection.strain(q_sound), projection.sections, forces_where(sound, tau))
-        )
-
-    change = change_of(imbalance, primals, tangents)
-    H = projection.stiffness(
-        tangent(projection.strain(q_sound), projection.sections, forces_where(sound, tau))
-    )
-    return (q, balanced, definite, steps), (
-        -lu.solve(H, change),
-        *no_derivative(balanced, definite, steps),
-    )
+    left = _imbalance(q, projection, tau)
+    return Root(q, norm(left, lu.substitute(elastic, left)) <= 16 * floor, definite, steps)
 
 
 class Prescribed(SteppedModel):

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..arm.scene import shared
-from ..mechanics.arm_balance import Kind, Problem, harmless, pull_of, rounding_of, with_tensions
+from ..mechanics.arm_balance import Kind, Problem, pull_of, rounding_of, with_tensions
 from ..mechanics.balance import residual, tangent, thread_direction, thread_wrench
 from ..mechanics.cable import path_length
 from ..mechanics.friction import kinks_of, share_left, turning_rate
@@ -24,8 +24,8 @@ from ..mechanics.reaction import Reaction, react, reaction_change
 from ..numerics import component as c, lu
 from ..numerics.batching import arms_in, side_by_side
 from ..numerics.component import Vector
-from ..numerics.implicit import change_of, no_derivative
-from ..numerics.newton import LOAD_SHARES, MOST_TURN, Damped, Solution, damped_newton
+from ..numerics.implicit import implicit_root
+from ..numerics.newton import LOAD_SHARES, MOST_TURN, Damped, Root, damped_newton
 from ..numerics.quadrature import Grid
 
 
@@ -223,14 +223,34 @@ def _by_strain(matrix: Array, length: Array) -> list[tuple[Array, Array | float]
     return [(matrix[:, :, i], length**2 if i < 3 else 1.0) for i in range(6)]
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(2,))
-def solve_prescribed(basis: Basis, problem: Problem, kind: Kind) -> Solution:
-    """Equilibrium in the basis, by damped Newton steps from rest. Derivatives are implicit, of any
-    order."""
-    return side_by_side(partial(_solve, kind))(basis, problem)
+def solve_prescribed(basis: Basis, problem: Problem, kind: Kind) -> Root:
+    """Equilibrium in the basis, by damped Newton steps from rest. Its point is an `Unknown`.
+    Derivatives are implicit, of any order."""
+
+    def row(unknown: Unknown, basis: Basis, problem: Problem) -> Array:
+        """Residual in a row."""
+        return jnp.concatenate(
+            imbalance(unknown, state_of(unknown, basis, problem, kind), basis, problem)
+        )
+
+    def linear_solve(unknown: Unknown, basis: Basis, problem: Problem, right: Array) -> Unknown:
+        split = partial(_split, size=unknown.q.size)
+        J = jax.jacfwd(lambda z: row(split(z), basis, problem))(jnp.concatenate(unknown))
+        return split(lu.solve(J, right))
+
+    def at_rest(unknown: Unknown, basis: Basis, problem: Problem) -> tuple:
+        return jax.tree.map(jnp.zeros_like, unknown), basis, problem.at_rest()
+
+    find = side_by_side(partial(_solve, kind))
+    return implicit_root(find, row, linear_solve, at_rest, basis, problem)
 
 
-def _solve(kind: Kind, basis: Basis, problem: Problem) -> Solution:
+def _split(z: Array, size: int) -> Unknown:
+    """Coordinates and tensions from a row of both."""
+    return Unknown(z[:size], z[size:])
+
+
+def _solve(kind: Kind, basis: Basis, problem: Problem) -> Root:
     stiffness = problem.sections.stiffness
     behind = problem.grid.h.ndim - 1
     arms = arms_in((basis, problem), behind)
@@ -249,9 +269,8 @@ def _solve(kind: Kind, basis: Basis, problem: Problem) -> Solution:
         r = imbalance(unknown, at, basis, part)
         J = approximate_tangent(unknown, at, basis, part, kind)
         factors = lu.factor(J.at[:size, :size].add((damping * K).astype(J.dtype)))
-        flat = lu.substitute(factors, jnp.concatenate(c.single(r)))
-        turn = sizes.turn(flat[:size].astype(K.dtype))
-        step = Unknown(flat[:size].astype(K.dtype), flat[size:].astype(K.dtype))
+        step = _split(lu.substitute(factors, jnp.concatenate(c.single(r))).astype(K.dtype), size)
+        turn = sizes.turn(step.q)
         moved = sizes.of_step(step)
         cut = MOST_TURN / jnp.maximum(turn, MOST_TURN)
         falling = (
@@ -270,34 +289,3 @@ def _solve(kind: Kind, basis: Basis, problem: Problem) -> Solution:
     )
     floor = jnp.broadcast_to(rounding_of(problem), arms)
     return damped_newton(evaluate, work, start, floor, 1 if problem.loads is None else LOAD_SHARES)
-
-
-def _residual(unknown: Unknown, basis: Basis, problem: Problem, kind: Kind) -> Array:
-    """Residual in a row."""
-    return jnp.concatenate(
-        imbalance(unknown, state_of(unknown, basis, problem, kind), basis, problem)
-    )
-
-
-def _jacobian(unknown: Unknown, basis: Basis, problem: Problem, kind: Kind) -> Array:
-    """Exact derivative of the residual by the coordinates and the tensions."""
-    size = unknown.q.size
-    return jax.jacfwd(lambda z: _residual(Unknown(z[:size], z[size:]), basis, problem, kind))(
-        jnp.concatenate(unknown)
-    )
-
-
-@partial(solve_prescribed.defjvp, symbolic_zeros=True)
-def _solve_prescribed_jvp(kind: Kind, primals: tuple, tangents: tuple) -> tuple[Solution, Solution]:
-    solution = solve_prescribed(*primals, kind)
-    sound = solution.balanced & solution.definite
-    unknown = Unknown(*(jnp.where(sound, x, 0.0) for x in solution.unknown))
-
-    change = change_of(
-        lambda basis, problem: _residual(unknown, basis, harmless(problem, sound), kind),
-        primals,
-        tangents,
-    )
-    J = _jacobian(unknown, primals[0], harmless(primals[1], sound), kind)
-    flat, size = -lu.solve(J, change), unknown.q.size
-    return solution, Solution(Unknown(flat[:size], flat[size:]), *no_derivative(*solution[1:]))

@@ -38,16 +38,26 @@ class Evaluation(NamedTuple):
     definite: Array
 
 
-class Root(NamedTuple):
-    """Where Newton's method ended: the point, whether the last tangent was positive definite, and
-    the steps taken."""
+class Iterate(NamedTuple):
+    """Where `newton` ended: the point, whether the last tangent was positive definite, and the
+    number of steps."""
 
     x: Any
     definite: Array
     steps: Array
 
 
-def newton(evaluate: Callable[[Any], Evaluation], start: Any, floor: Array) -> Root:
+class Root(NamedTuple):
+    """Result of a root search: the point, whether the residual vanishes there, whether the tangent
+    is positive definite there, and the number of evaluations."""
+
+    x: Any
+    converged: Array
+    definite: Array
+    steps: Array
+
+
+def newton(evaluate: Callable[[Any], Evaluation], start: Any, floor: Array) -> Iterate:
     """Root of a residual from `start`.
 
     A step that does not lower the residual's size is cut to a quarter and tried again. The loop
@@ -82,7 +92,7 @@ def newton(evaluate: Callable[[Any], Evaluation], start: Any, floor: Array) -> R
     first = Evaluation(still, jnp.zeros_like(merit), merit, jnp.ones(merit.shape, bool))
     begin = (start, first, jnp.ones_like(merit), jnp.zeros_like(merit), jnp.zeros((), jnp.int32))
     x, at, _, _, count = lax.while_loop(proceed, advance, begin)
-    return Root(jax.tree.map(jnp.subtract, x, at.step), at.definite, count)
+    return Iterate(jax.tree.map(jnp.subtract, x, at.step), at.definite, count)
 
 
 class Damped(NamedTuple):
@@ -96,23 +106,13 @@ class Damped(NamedTuple):
     definite: Array
 
 
-class Solution(NamedTuple):
-    """The unknowns, whether they balance, whether the tangent is positive definite there, and the
-    evaluations taken."""
-
-    unknown: Any
-    balanced: Array
-    definite: Array
-    steps: Array
-
-
 def damped_newton(
     evaluate: Callable[[Any, Array, Array], Damped],
     work: Callable[[Any, Any], Array],
     start: Any,
     floor: Array,
     shares: int = 1,
-) -> Solution:
+) -> Root:
     r"""Root of a residual that is the gradient of an energy, or nearly so, by Newton's method with
     Levenberg's damping.
 
@@ -142,7 +142,7 @@ def damped_newton(
     - `floor`: size of the residual that counts as rounding, of the shape of the problems side by
       side.
 
-    **Returns:** a `Solution`; it balances if the residual at the end is rounding or as small as a
+    **Returns:** a `Root`; it is converged if the residual at the end is rounding or as small as a
     negligible step.
     """
     small = jnp.finfo(floor.dtype).eps ** 0.75
@@ -222,7 +222,7 @@ def damped_newton(
     x, _, guard = lax.while_loop(
         lambda state: jnp.any(pending(state[2])), advance, (start, step, guard)
     )
-    return Solution(x, guard.merit <= accepted, guard.definite, guard.spent)
+    return Root(x, guard.merit <= accepted, guard.definite, guard.spent)
 
 
 class _Guard(NamedTuple):
