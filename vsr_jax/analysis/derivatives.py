@@ -16,6 +16,7 @@ from ..arm.scene import Scene
 from ..arm.scene_numbers import parameters, replaced
 from ..mechanics.balance import chosen_rows, tangent
 from ..numerics import component as c
+from ..numerics.se3 import unskew
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
 from ..typing import Pose
@@ -104,10 +105,7 @@ def _by_numbers(eq: Equilibrium) -> tuple[Array, Array, Array]:
 def _motion(tip: Pose, here: Pose) -> Float[Array, "6"]:
     """Turn and displacement from a pose nearby, to first order, in the world's axes."""
     turn = tip[:3, :3] @ jax.lax.stop_gradient(here)[:3, :3].T
-    axis = 0.5 * jnp.stack(
-        [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
-    )
-    return jnp.concatenate([axis, tip[:3, 3] - jax.lax.stop_gradient(here)[:3, 3]])
+    return jnp.concatenate([unskew(turn), tip[:3, 3] - jax.lax.stop_gradient(here)[:3, 3]])
 
 
 def tip_jacobian(eq: Equilibrium) -> Float[Array, "6 inputs"]:

@@ -155,11 +155,9 @@ def shares_at(
     sections, breaks = scene.sections(grid.X), breaks_of(scene.breakpoints, grid)
     for place, rate in zip(scene.frictional, turning, strict=True):
         reach, kinks = sections.reach[place], kinks_of(xi, sections, breaks, place, grid)
-        left = decay_at(
-            rate if reach is None else reach * rate, kinks, _signed_friction(scene, place), grid, X
-        )
-        here = shares[place]
-        shares[place] = left if here is None else here * left
+        rate = c.times(reach, rate)
+        left = decay_at(rate, kinks, _signed_friction(scene, place), grid, X)
+        shares[place] = c.times(shares[place], left)
     return tuple(shares)
 
 

@@ -31,7 +31,7 @@ from .arm_balance import (
     with_tensions,
 )
 from .arm_tangent import approximate_solve, tangent_solve
-from .balance import chosen, completed, solve_balance, spread, with_locked
+from .balance import chosen, completed, largest_force_scale, solve_balance, spread, with_locked
 
 
 def solve_arm(problem: Problem, kind: Kind) -> Root:
@@ -110,7 +110,7 @@ class _Sizes(NamedTuple):
         wrench = spread(imbalance.wrench, self.kind.free)
         bent = shape_of(wrench, self.sections.stiffness, self.length)
         square = jnp.sum(self.grid.weight * bent**2, axis=(0, 1)) / self.length
-        axial = jnp.max(self.sections.stiffness[3], axis=(0, 1))
+        axial = largest_force_scale(self.sections.stiffness)
         others = (
             *(force / axial for force in imbalance.cable),
             *self._rubbed(imbalance.turning, at),

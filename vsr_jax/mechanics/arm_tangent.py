@@ -60,8 +60,8 @@ def approximate_solve(
         thread_wrench(thread_direction(unknown.xi, sections.paths[i])[0], sections.paths[i])
         for i in kind.cables
     ]
-    pulls = [_times(at.carried[i], unit) for i, unit in zip(kind.cables, units, strict=True)]
-    lengths = [_times(sections.reach[i], unit) for i, unit in zip(kind.cables, units, strict=True)]
+    pulls = [c.times(at.carried[i], unit) for i, unit in zip(kind.cables, units, strict=True)]
+    lengths = [c.times(sections.reach[i], unit) for i, unit in zip(kind.cables, units, strict=True)]
     answers, _ = jax.vmap(solve)(jax.tree.map(lambda *v: jnp.stack(v), *pulls))
     shortening = jnp.stack(
         [jnp.sum(grid.weight * c.dot(length, answers), axis=(1, 2)) for length in lengths]
@@ -75,10 +75,6 @@ def approximate_solve(
         for a, answer in zip(strain, answers, strict=True)
     )
     return Unknown(strain, tuple(tension), right.turning), negative == held
-
-
-def _times(share: Array | None, wrench: Vector) -> Vector:
-    return wrench if share is None else c.scale(share, wrench)
 
 
 def _tensions(

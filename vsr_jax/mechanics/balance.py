@@ -115,19 +115,29 @@ def tangent(xi: Vector, sections: CrossSections, tau: Vector) -> Matrix:
     return tuple(tuple(row) for row in rows)
 
 
+def force_scale(stiffness: Vector) -> Array:
+    r"""Force that makes a strain of 1, the axial stiffness $\Sigma_{44}$ [N]: the scale of all
+    convergence tests."""
+    return stiffness[3]
+
+
+def largest_force_scale(stiffness: Vector) -> Array:
+    """Largest `force_scale` of the nodes of an arm [N]."""
+    return jnp.max(force_scale(stiffness), axis=(0, 1))
+
+
 def strain_norm(wrench: Vector, stiffness: Vector) -> Array:
-    r"""Size of a wrench as a strain without unit, $\sqrt{F^T \Sigma^{-1} F / \Sigma_{44}}$: the
-    same for every scale of arm."""
-    return jnp.sqrt(
-        dot(wrench, tuple(f / s for f, s in zip(wrench, stiffness, strict=True))) / stiffness[3]
-    )
+    r"""Dimensionless size of a wrench as a strain, $\sqrt{F^T \Sigma^{-1} F / \Sigma_{44}}$."""
+    strain = tuple(f / s for f, s in zip(wrench, stiffness, strict=True))
+    return jnp.sqrt(dot(wrench, strain) / force_scale(stiffness))
 
 
 def rounding_floor(stiffness: Vector, tau: Vector) -> Array:
     """What is left of `strain_norm` of a balanced residual in floating point: a multiple of the
     machine's epsilon."""
-    load = sum((jnp.abs(force) for force in tau), jnp.zeros_like(stiffness[3]))
-    return 64 * jnp.finfo(stiffness[3].dtype).eps * (1 + load / stiffness[3])
+    scale = force_scale(stiffness)
+    load = sum((jnp.abs(force) for force in tau), jnp.zeros_like(scale))
+    return 64 * jnp.finfo(scale.dtype).eps * (1 + load / scale)
 
 
 def forces_where(sound: Array, tau: Vector) -> Vector:
@@ -259,16 +269,15 @@ def _find_balance(
     floor = jnp.broadcast_to(rounding_floor(stiffness, tau), shape)
 
     compliance = tuple(1 / s for s in stiffness)
+    per_force = force_scale(compliance)
 
     def evaluate(xi: Vector) -> Evaluation:
         r, step = newton_step(xi, sections, tau, reaction, free)
         elastic = multiply(chosen(compliance, free), r)
         definite = ~jnp.isnan(step[-1])
         step = tuple(jnp.where(definite, x, e) for x, e in zip(step, elastic, strict=True))
-        size = jnp.sqrt(dot(step, multiply(chosen(stiffness, free), step)) * compliance[3])
-        return Evaluation(
-            spread(step, free), size, jnp.sqrt(dot(r, elastic) * compliance[3]), definite
-        )
+        size = jnp.sqrt(dot(step, multiply(chosen(stiffness, free), step)) * per_force)
+        return Evaluation(spread(step, free), size, jnp.sqrt(dot(r, elastic) * per_force), definite)
 
     first = rest if start is None else with_locked(start, rest, free)
     xi, definite, steps = newton(evaluate, first, floor)

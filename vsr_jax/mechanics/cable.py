@@ -11,10 +11,11 @@ from jaxtyping import Array
 
 from ..arm.actuator import Tendon
 from ..arm.scene import CrossSections, Scene
+from ..numerics import component as c
 from ..numerics.component import Vector
 from ..numerics.quadrature import Grid
 from ..typing import Scalar
-from .balance import thread_direction
+from .balance import largest_force_scale, thread_direction
 
 
 class Cable(NamedTuple):
@@ -54,10 +55,11 @@ def cable_of(
     assert isinstance(tendon, Tendon)
     length = path_length(sections.rest, sections, place, grid) + change
     compliance = None if tendon.stiffness is None else 1 / tendon.stiffness
-    return Cable(length, compliance, jnp.max(sections.stiffness[3]) / scene.rod.length)
+    scale = largest_force_scale(sections.stiffness) / scene.rod.length
+    return Cable(length, compliance, scale)
 
 
 def path_length(xi: Vector, sections: CrossSections, place: int, grid: Grid) -> Array:
     r"""Length of a thread's path, $\int |t_c| dX$ [m], from the strain at the nodes."""
     length, reach = thread_direction(xi, sections.paths[place])[1], sections.reach[place]
-    return jnp.sum(grid.weight * (length if reach is None else length * reach), axis=(0, 1))
+    return jnp.sum(grid.weight * c.times(reach, length), axis=(0, 1))

@@ -21,7 +21,7 @@ from ..arm.scene import CrossSections
 from ..numerics import component as c
 from ..numerics.component import Vector
 from ..numerics.quadrature import Grid, beyond, interpolation, locate, weighted, within
-from .balance import actuation_wrench, chosen, chosen_rows, residual, spread, tangent, with_locked
+from .balance import actuation_wrench, chosen, chosen_rows, completed, residual, tangent
 
 
 class Friction(NamedTuple):
@@ -46,9 +46,7 @@ def share_left(
 ) -> Array:
     """Share of a thread's force at the nodes, from where it reaches (None for everywhere), how it
     turns there and its kinks."""
-    if reach is None:
-        return decay(turning, kinks, coefficient, grid)
-    return reach * decay(reach * turning, kinks, coefficient, grid)
+    return c.times(reach, decay(c.times(reach, turning), kinks, coefficient, grid))
 
 
 def decay_at(
@@ -121,8 +119,7 @@ def strain_rate(
     right = c.subtract(actuation_wrench(xi, sections, tau_rate), change)
     right = right if reaction_rate is None else c.add(right, reaction_rate)
     factor = c.cholesky(chosen_rows(tangent(xi, sections, tau), free))
-    answer = spread(c.cholesky_solve(factor, chosen(right, free)), free)
-    return with_locked(answer, rate.rest, free)
+    return completed(c.cholesky_solve(factor, chosen(right, free)), rate.rest, free)
 
 
 def _alike(values: tuple, rates: tuple) -> tuple[Any, Any]:

@@ -32,7 +32,7 @@ from ..numerics.quadrature import (
     weighted,
     within,
 )
-from ..numerics.se3 import rotation_components
+from ..numerics.se3 import base_pose, rotation_components
 
 
 class FollowerPoint(NamedTuple):
@@ -52,7 +52,7 @@ class Loading(NamedTuple):
       beforehand; `dead_density`: $(c, f)$ in the world frame;
     - `follower_density`: $(c, f)$ in the body frame; `follower_points`: wrenches at points in the
       body frame;
-    - `base`: rotation of the base, the identity for None.
+    - `base`: pose of the base, the identity for None.
     """
 
     dead: Vector | None
@@ -120,8 +120,7 @@ def loading(scene: Scene, grid: Grid) -> Loading | None:
         FollowerPoint(jnp.sum(grid.start < X), (grid.X < X).astype(X.dtype), wrench)
         for X, wrench in scene.point_wrenches("body")
     )
-    base = None if scene.rod.base is None else scene.rod.base[:3, :3]
-    return Loading(dead, density, scene.density(grid.X, "body"), points, base)
+    return Loading(dead, density, scene.density(grid.X, "body"), points, scene.rod.base)
 
 
 def partial_rotation(k: Vector, h: Array, sigma: Array | float) -> Vector:
@@ -154,7 +153,7 @@ def rotations(k: Vector, h: Array, base: Array | None) -> tuple[Matrix, Matrix, 
     omega = step_components(
         tuple((*(x[i] for x in k), zero[i], zero[i], zero[i]) for i in range(stages)), h
     )[:3]
-    matrix = jnp.eye(3, dtype=h.dtype) if base is None else base
+    matrix = base_pose(base, h.dtype)[:3, :3]
     first = tuple(tuple(jnp.broadcast_to(x, zero[0, 0].shape) for x in row) for row in matrix)
     end, starts = lax.scan(lambda R, E: (c.matmul(R, E), R), first, rotation_components(omega))
     nodes = jnp.asarray(gauss_legendre(stages)[0], h.dtype).reshape(-1, *(1,) * h.ndim)

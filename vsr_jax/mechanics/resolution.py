@@ -93,7 +93,7 @@ def _threads(
     shear = jnp.maximum(shear - pushed, _STIFF * shear)
     for path, reach, force in zip(sections.paths, sections.reach, forces, strict=True):
         square, slope = path.y**2 + path.z**2, path.slope_y**2 + path.slope_z**2
-        inside = lever if reach is None else reach * lever
+        inside = c.times(reach, lever)
         phase = (
             jnp.sqrt(_ratio(jnp.sum(inside * slope), jnp.sum(inside * square)))
             * length

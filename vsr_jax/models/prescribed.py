@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from ..arm.scene import CrossSections, Scene
 from ..mechanics.arm_balance import problem_of, with_tensions
 from ..mechanics.balance import (
+    force_scale,
     forces_where,
     residual,
     rounding_floor,
@@ -95,7 +96,7 @@ def _tangent(q: Array, projection: Projection, tau: Vector) -> Array:
 def _find_projected(projection: Projection, tau: Vector) -> Root:
     K = projection.elastic_stiffness()
     elastic = lu.factor(K)
-    axial = jnp.sum(projection.weight * projection.sections.stiffness[3])
+    axial = jnp.sum(projection.weight * force_scale(projection.sections.stiffness))
 
     def norm(force: Array, change: Array) -> Array:
         return jnp.sqrt(jnp.maximum(force @ change, 0.0) / axial)

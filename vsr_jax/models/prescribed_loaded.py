@@ -17,7 +17,13 @@ from jaxtyping import Array, Float
 
 from ..arm.scene import shared
 from ..mechanics.arm_balance import Kind, Problem, pull_of, rounding_of, with_tensions
-from ..mechanics.balance import residual, tangent, thread_direction, thread_wrench
+from ..mechanics.balance import (
+    largest_force_scale,
+    residual,
+    tangent,
+    thread_direction,
+    thread_wrench,
+)
 from ..mechanics.cable import path_length
 from ..mechanics.friction import kinks_of, share_left, turning_rate
 from ..mechanics.reaction import Reaction, react, reaction_change
@@ -149,11 +155,11 @@ def approximate_tangent(
         for i in kind.cables
     ]
     pulls = [
-        _projected(matrix, c.scale(_one(at.shares[i]), unit), grid)
+        _projected(matrix, c.times(at.shares[i], unit), grid)
         for i, unit in zip(kind.cables, units, strict=True)
     ]
     lengths = [
-        _projected(matrix, c.scale(_one(sections.reach[i]), unit), grid)
+        _projected(matrix, c.times(sections.reach[i], unit), grid)
         for i, unit in zip(kind.cables, units, strict=True)
     ]
     rows = []
@@ -172,10 +178,6 @@ def approximate_tangent(
     return jnp.concatenate(
         [jnp.concatenate([K, jnp.stack(pulls, axis=1)], axis=1), jnp.stack(rows)]
     )
-
-
-def _one(share: Array | None) -> Array | float:
-    return 1.0 if share is None else share
 
 
 class _Sizes(NamedTuple):
@@ -210,12 +212,11 @@ def _sizes_of(basis: Basis, K: Array, problem: Problem, kind: Kind) -> _Sizes:
         for m, w in _by_strain(basis.matrix, length)
     ]
     pulls = [jnp.max(pull_of(sections, place, length), axis=(0, 1)) for place in kind.cables]
-    axial = jnp.max(sections.stiffness[3], axis=(0, 1))
     return _Sizes(
         sum(gram[1:], gram[0]),
         lu.factor(K),
         jnp.stack(pulls) if pulls else jnp.zeros((0, *length.shape), K.dtype),
-        axial,
+        largest_force_scale(sections.stiffness),
     )
 
 

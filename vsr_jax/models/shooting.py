@@ -28,7 +28,7 @@ from ..mechanics.friction import reaction_rate, strain_rate
 from ..numerics import component as c
 from ..numerics.component import Vector
 from ..numerics.quadrature import Grid
-from ..numerics.se3 import hat, rotation_components
+from ..numerics.se3 import base_pose, hat, rotation_components, unskew
 
 _SHOTS = 12
 _INSIDE = 1e-10  # of a segment: what is evaluated at its ends belongs to it
@@ -233,13 +233,11 @@ def _scale(scene: Scene, first: Unknown, count: int) -> Array:
 def _misfit(scene: Scene, unknown: Unknown, ends: Array, segments: Grid) -> Array:
     """What is wrong at the start of each segment: rotation (3) against the one before, reaction (6)
     at its end against the next."""
-    base = jnp.eye(3, dtype=ends.dtype) if scene.rod.base is None else scene.rod.base[:3, :3]
+    base = base_pose(scene.rod.base, ends.dtype)[:3, :3]
     wrench, rotation = ends[:, :6], ends[:, 6:].reshape(-1, 3, 3)
     before = jnp.concatenate([base[None], rotation[:-1]])
     m = jnp.einsum("sji,sjk->sik", before, unknown.rotation)
-    turn = 0.5 * jnp.stack(
-        [m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]], axis=1
-    )
+    turn = unskew(m)
     carried = jnp.concatenate([unknown.reaction[1:], jnp.zeros_like(wrench[:1])])
     for frame in ("world", "body"):
         for X, point in scene.point_wrenches(frame):

@@ -78,6 +78,11 @@ def scale(s: Array | float, a: Tree) -> Tree:
     return jax.tree.map(lambda x: s * x, a)
 
 
+def times(factor: Array | None, a: Tree) -> Tree:
+    """`scale`, where None stands for the factor 1 and costs no operation."""
+    return a if factor is None else scale(factor, a)
+
+
 def dot(a: Vector, b: Vector) -> Array:
     """Scalar product $a \\cdot b$."""
     total = a[0] * b[0]

@@ -17,7 +17,17 @@ from ..typing import Pose, Scalar, Twist
 from ..validation import choice
 from . import component as c
 from .component import Matrix, Vector
-from .se3 import adjoint, bracket_components, compose_components, exp, exp_components, inverse, pose
+from .se3 import (
+    adjoint,
+    base_pose,
+    bracket_components,
+    compose_components,
+    exp,
+    exp_components,
+    inverse,
+    pose,
+    vee,
+)
 
 ORDERS = (2, 4, 6)
 """Orders of the steps; order 2 s uses s Gauss points a step."""
@@ -95,10 +105,8 @@ def zanna_step(xi_1: Twist, xi_2: Twist, h: Scalar) -> Twist:
 def base_components(base: Pose | None, like: Array) -> tuple[Matrix, Vector]:
     """Rotation and position of the base as components of `like`'s shape and dtype; the identity for
     None."""
-    matrix = jnp.eye(4, dtype=like.dtype) if base is None else base
-    rows = tuple(
-        tuple(jnp.broadcast_to(x, like.shape) for x in c.split(matrix[i])) for i in range(3)
-    )
+    matrix = base_pose(base, like.dtype)
+    rows = tuple(tuple(jnp.broadcast_to(x, like.shape) for x in row) for row in matrix[:3])
     return tuple(row[:3] for row in rows), tuple(row[3] for row in rows)
 
 
@@ -155,8 +163,7 @@ def step_jacobian(
 
     def column(rate: Float[Array, "stages 6"]) -> Twist:
         g, rate_of_g = jax.jvp(lambda xi: exp(step_twist(xi, h)), (strains,), (rate,))
-        m = inverse(g) @ rate_of_g
-        return jnp.stack([m[2, 1], m[0, 2], m[1, 0], m[0, 3], m[1, 3], m[2, 3]])
+        return vee(inverse(g) @ rate_of_g)
 
     return jax.vmap(column, in_axes=-1, out_axes=-1)(rates)
 

@@ -9,9 +9,11 @@ kernels.
 
 import math
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..typing import Pose, Twist
@@ -93,6 +95,14 @@ def skew(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
     return c.join_matrix(c.skew(c.split(v)))
 
 
+def unskew(matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch 3"]:
+    r"""Vector $v$ of the skew part of a matrix, $\tilde v = (A - A^T) / 2$ of its upper left block
+    of three rows."""
+    m = matrix
+    parts = (m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1])
+    return 0.5 * jnp.stack(parts, axis=-1)
+
+
 def hat(xi: Twist) -> Pose:
     r"""Matrix of a twist (eq. 2).
 
@@ -114,9 +124,7 @@ def vee(matrix: Pose) -> Twist:
 
     **Returns:** $\xi = (k, u)$, shape (6,).
     """
-    m = matrix
-    angular = 0.5 * jnp.stack([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]])
-    return jnp.concatenate([angular, m[:3, 3]])
+    return jnp.concatenate([unskew(matrix), matrix[:3, 3]])
 
 
 def pose(rotation: Matrix, position: Vector) -> Float[Array, "*batch 4 4"]:
@@ -124,6 +132,11 @@ def pose(rotation: Matrix, position: Vector) -> Float[Array, "*batch 4 4"]:
     zero = jnp.zeros_like(position[0])
     rows = [(*row, x) for row, x in zip(rotation, position, strict=True)]
     return c.join_matrix((*rows, (zero, zero, zero, zero + 1.0)))
+
+
+def base_pose(base: Array | None, dtype: Any) -> Array | np.ndarray:
+    """Pose of the base, shape (4, 4) or (4, 4, arms); the identity for None."""
+    return np.eye(4, dtype=dtype) if base is None else base
 
 
 def exp(omega: Twist) -> Pose:
@@ -153,13 +166,7 @@ def rotation_vector(rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
     Smooth but at half a turn, where both signs are right. The axis is that of the skew part,
     $\sin\theta\, n$; for large angles that of the symmetric part, $(1 - \cos\theta)\, n n^T$.
     """
-    axis = 0.5 * jnp.stack(
-        [
-            rotation[2, 1] - rotation[1, 2],
-            rotation[0, 2] - rotation[2, 0],
-            rotation[1, 0] - rotation[0, 1],
-        ]
-    )
+    axis = unskew(rotation)
     cosine = 0.5 * (jnp.trace(rotation) - 1)
     square = jnp.dot(axis, axis)
     near, large = (square < 1e-8) & (cosine > 0), cosine < -0.5
