@@ -22,15 +22,15 @@ from jaxtyping import Array, Float
 
 from ..arm.scene import Scene
 from ..mechanics.arm_balance import (
+    ArmProblem,
+    ArmUnknown,
     Kind,
-    Problem,
-    Unknown,
     imbalance_of,
     problem_of,
     state_of,
     with_tensions,
 )
-from ..mechanics.balance import chosen, spread, with_locked
+from ..mechanics.balance import free_components, spread, with_locked
 from ..models.base import Outcome, Status, resolved
 from ..models.strain_dependent import StrainDependent
 from ..solution.equilibrium import Equilibrium
@@ -141,11 +141,11 @@ class _System(NamedTuple):
     model: StrainDependent
     scale: Array
 
-    def problem(self, s: Array) -> tuple[Problem, Kind]:
+    def problem(self, s: Array) -> tuple[ArmProblem, Kind]:
         scene, inputs = _at(self.scene, self.path, s)
         return problem_of(scene, inputs, self.model.grid(scene))
 
-    def unknown(self, u: Array, problem: Problem, kind: Kind) -> Unknown:
+    def unknown(self, u: Array, problem: ArmProblem, kind: Kind) -> ArmUnknown:
         """The unknowns in their own form; locked strains have their rest value."""
         shape, size = problem.grid.X.shape, problem.grid.X.size
         values = u[:-1] / self.scale
@@ -153,7 +153,7 @@ class _System(NamedTuple):
         xi = with_locked(spread(tuple(strain), kind.free), problem.sections.rest, kind.free)
         rest = values[strain.size :]
         tension, turning = rest[: len(kind.cables)], rest[len(kind.cables) :].reshape(-1, *shape)
-        return Unknown(xi, tuple(tension), tuple(turning))
+        return ArmUnknown(xi, tuple(tension), tuple(turning))
 
     def residual(self, u: Array) -> Array:
         """Imbalance as the gradient of an energy without unit by `u`."""
@@ -177,7 +177,7 @@ def _system(scene: Any, path: Any, start: Equilibrium) -> tuple[_System, Array]:
     turning = start._state.turning
     parts = [
         (x, share * length if i < 3 else share)
-        for i, x in zip(kind.free, chosen(start._state.xi, kind.free), strict=True)
+        for i, x in zip(kind.free, free_components(start._state.xi, kind.free), strict=True)
     ]
     parts += [(x, 1 / axial) for x in tension] + [(x, share * length) for x in turning]
     values, scale = (

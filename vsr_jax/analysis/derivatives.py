@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from ..arm.loads import TipWrench
 from ..arm.scene import Scene
 from ..arm.scene_numbers import parameters, replaced
-from ..mechanics.balance import chosen_rows, tangent
+from ..mechanics.balance import free_block, tangent
 from ..numerics import component as c
 from ..numerics.se3 import unskew
 from ..solution.equilibrium import Equilibrium
@@ -153,7 +153,7 @@ def _compliance(eq: Equilibrium) -> Array:
         )
     nodes, free = eq._nodes(), jnp.array(eq.scene.free)
     rows = tangent(nodes.xi, nodes.sections, nodes.tau(eq._sound_forces))
-    H = c.join_matrix(c.symmetric(chosen_rows(rows, eq.scene.free))).reshape(
+    H = c.join_matrix(c.symmetric(free_block(rows, eq.scene.free))).reshape(
         -1, free.size, free.size
     )
     poses = eq._poses(nodes.grid.X.reshape(-1))

@@ -212,7 +212,7 @@ def _moving(task: _Task, found: bounded_least_squares.Nearest) -> Array:
     weight is nothing."""
 
     def half(share: Array) -> Array:
-        effort = bounded_least_squares.weight(share.dtype) * (share - task.idle)
+        effort = bounded_least_squares.last_weight(share.dtype) * (share - task.idle)
         return (jnp.sum(task.missed(share) ** 2) + jnp.sum(effort**2)) / 2
 
     def slope(share: Array) -> Array:

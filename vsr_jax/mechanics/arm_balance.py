@@ -23,22 +23,22 @@ from ..arm.scene import CrossSections, Scene, shared
 from ..numerics import component as c
 from ..numerics.component import Vector
 from ..numerics.quadrature import Grid
-from .balance import chosen, residual, thread_direction, thread_wrench, without_force
+from .balance import free_components, residual, thread_direction, thread_wrench, without_force
 from .cable import Cable, cable_of, path_length
 from .friction import (
     Friction,
+    balanced_strain_rate,
     breaks_of,
     decay_at,
     kinks_of,
     reaction_rate,
     share_left,
-    strain_rate,
     turning_rate,
 )
 from .reaction import Loading, Reaction, loading, react
 
 
-class Problem(NamedTuple):
+class ArmProblem(NamedTuple):
     """What is to be balanced: `forces` of the threads at their start (ignored for cables), and what
     ties the sections."""
 
@@ -49,11 +49,11 @@ class Problem(NamedTuple):
     cables: tuple[Cable, ...]
     friction: Friction | None
 
-    def with_share(self, share: Array) -> "Problem":
+    def with_share(self, share: Array) -> "ArmProblem":
         """The problem with a share of its loads."""
         return self if self.loads is None else self._replace(loads=self.loads.scaled(share))
 
-    def at_rest(self) -> "Problem":
+    def at_rest(self) -> "ArmProblem":
         """The problem without loads and forces and with slack cables, so that its solution is the
         rest strain."""
         cables = tuple(cable._replace(length=2 * cable.length) for cable in self.cables)
@@ -70,7 +70,7 @@ class Kind(NamedTuple):
     frictional: tuple[int, ...]
 
 
-class Unknown(NamedTuple):
+class ArmUnknown(NamedTuple):
     r"""Strain at the nodes (six component arrays), tension [N] of each cable, $\varphi'$ [rad/m] at
     the nodes of each tendon with friction."""
 
@@ -79,7 +79,7 @@ class Unknown(NamedTuple):
     turning: Vector
 
 
-class Imbalance(NamedTuple):
+class ArmImbalance(NamedTuple):
     """Residual: wrench at the nodes for the free strains, force of each cable [N], turning rate of
     each tendon with friction."""
 
@@ -88,7 +88,7 @@ class Imbalance(NamedTuple):
     turning: Vector
 
 
-class State(NamedTuple):
+class ArmState(NamedTuple):
     """What follows from the unknowns: share of each thread's force at the nodes (None for all), its
     force there, the reaction, the slack of each cable [m]."""
 
@@ -98,7 +98,7 @@ class State(NamedTuple):
     slack: Vector
 
 
-def problem_of(scene: Scene, inputs: Array, grid: Grid) -> tuple[Problem, Kind]:
+def problem_of(scene: Scene, inputs: Array, grid: Grid) -> tuple[ArmProblem, Kind]:
     """What is to be balanced on a grid."""
     sections, forces = scene.sections(grid.X), scene.forces(inputs)
     cables = [
@@ -112,7 +112,7 @@ def problem_of(scene: Scene, inputs: Array, grid: Grid) -> tuple[Problem, Kind]:
             rate,
             breaks_of(scene.breakpoints, grid),
         )
-    problem = Problem(grid, sections, forces, loading(scene, grid), tuple(cables), friction)
+    problem = ArmProblem(grid, sections, forces, loading(scene, grid), tuple(cables), friction)
     return problem, Kind(scene.free, scene.length_driven, scene.frictional)
 
 
@@ -124,7 +124,7 @@ def with_tensions(forces: Vector, tensions: Iterable[Array], kind: Kind) -> Vect
     return tuple(found)
 
 
-def state_of(unknown: Unknown, problem: Problem, kind: Kind) -> State:
+def state_of(unknown: ArmUnknown, problem: ArmProblem, kind: Kind) -> ArmState:
     """What follows from the unknowns."""
     grid, sections, xi = problem.grid, problem.sections, unknown.xi
     carried = list(sections.reach)
@@ -141,7 +141,7 @@ def state_of(unknown: Unknown, problem: Problem, kind: Kind) -> State:
         cable.slack(tension, path_length(xi, sections, place, grid), carried[place], grid)
         for place, cable, tension in zip(kind.cables, problem.cables, unknown.tension, strict=True)
     )
-    return State(tuple(carried), tau, along, slack)
+    return ArmState(tuple(carried), tau, along, slack)
 
 
 def shares_at(
@@ -168,22 +168,24 @@ def _signed_friction(scene: Scene, place: int) -> Array:
     return tendon.friction if tendon.motion == "pull" else -tendon.friction
 
 
-def imbalance_of(unknown: Unknown, at: State, problem: Problem, kind: Kind) -> Imbalance:
+def imbalance_of(
+    unknown: ArmUnknown, at: ArmState, problem: ArmProblem, kind: Kind
+) -> ArmImbalance:
     """The residual."""
     wrench = None if at.along is None else at.along.wrench
-    r = chosen(residual(unknown.xi, problem.sections, at.tau, wrench), kind.free)
+    r = free_components(residual(unknown.xi, problem.sections, at.tau, wrench), kind.free)
     cables = tuple(
         cable.complementarity(tension, slack)
         for cable, tension, slack in zip(problem.cables, unknown.tension, at.slack, strict=True)
     )
     if problem.friction is None:
-        return Imbalance(r, cables, ())
+        return ArmImbalance(r, cables, ())
     rates = _turning_rates(unknown, at, problem, problem.friction, kind)
-    return Imbalance(r, cables, c.subtract(unknown.turning, rates))
+    return ArmImbalance(r, cables, c.subtract(unknown.turning, rates))
 
 
 def _turning_rates(
-    unknown: Unknown, at: State, problem: Problem, friction: Friction, kind: Kind
+    unknown: ArmUnknown, at: ArmState, problem: ArmProblem, friction: Friction, kind: Kind
 ) -> Vector:
     xi, sections, loads = unknown.xi, problem.sections, problem.loads
     slopes = [jnp.zeros_like(xi[0])] * len(at.tau)
@@ -195,7 +197,7 @@ def _turning_rates(
     if at.along is not None and loads is not None:
         change = reaction_rate(xi, at.along.wrench, at.along.body_density)
     tau = tuple(jnp.broadcast_to(force, xi[0].shape) for force in at.tau)
-    xi_rate = strain_rate(
+    xi_rate = balanced_strain_rate(
         xi, tau, tuple(slopes), change, sections, friction.sections_rate, kind.free
     )
     return tuple(
@@ -227,7 +229,7 @@ def pull_of(sections: CrossSections, place: int, length: Array) -> Array:
     )
 
 
-def rounding_of(problem: Problem) -> Array:
+def rounding_of(problem: ArmProblem) -> Array:
     """What is left of the `shape_size` of a balanced residual in floating point, of the shape of
     the arms side by side.
 

@@ -17,11 +17,11 @@ from ..numerics.newton import LOAD_SHARES, MOST_TURN, Damped, Root, damped_newto
 from ..numerics.quadrature import Grid
 from ..typing import cast
 from .arm_balance import (
-    Imbalance,
+    ArmImbalance,
+    ArmProblem,
+    ArmState,
+    ArmUnknown,
     Kind,
-    Problem,
-    State,
-    Unknown,
     imbalance_of,
     pull_of,
     rounding_of,
@@ -31,42 +31,49 @@ from .arm_balance import (
     with_tensions,
 )
 from .arm_tangent import approximate_solve, tangent_solve
-from .balance import chosen, completed, largest_force_scale, solve_balance, spread, with_locked
+from .balance import (
+    completed,
+    free_components,
+    largest_force_scale,
+    solve_balance,
+    spread,
+    with_locked,
+)
 
 
-def solve_arm(problem: Problem, kind: Kind) -> Root:
+def solve_arm(problem: ArmProblem, kind: Kind) -> Root:
     """Equilibrium of the arm, from the balance without loads and with slack cables. Its point is an
-    `Unknown`.
+    `ArmUnknown`.
 
     Derivatives are implicit, of any order, in forward and reverse mode: the exact tangent is solved
     by refining `approximate_solve`.
     """
 
-    def find(problem: Problem) -> Root:
+    def find(problem: ArmProblem) -> Root:
         root = side_by_side(partial(_solve, kind))(_start(problem, kind), problem)
-        return root._replace(x=root.x._replace(xi=chosen(root.x.xi, kind.free)))
+        return root._replace(x=root.x._replace(xi=free_components(root.x.xi, kind.free)))
 
-    def whole(x: Unknown, problem: Problem) -> Unknown:
+    def whole(x: ArmUnknown, problem: ArmProblem) -> ArmUnknown:
         return x._replace(xi=completed(x.xi, problem.sections.rest, kind.free))
 
-    def imbalance(x: Unknown, problem: Problem) -> Imbalance:
+    def imbalance(x: ArmUnknown, problem: ArmProblem) -> ArmImbalance:
         unknown = whole(x, problem)
         return imbalance_of(unknown, state_of(unknown, problem, kind), problem, kind)
 
-    def linear_solve(x: Unknown, problem: Problem, right: Imbalance) -> Unknown:
+    def linear_solve(x: ArmUnknown, problem: ArmProblem, right: ArmImbalance) -> ArmUnknown:
         _, apply = jax.linearize(lambda x: imbalance(x, problem), x)
         return tangent_solve(apply, whole(x, problem), problem, right, kind)
 
-    def at_rest(x: Unknown, problem: Problem) -> tuple[Unknown, Problem]:
+    def at_rest(x: ArmUnknown, problem: ArmProblem) -> tuple[ArmUnknown, ArmProblem]:
         zero = jax.tree.map(jnp.zeros_like, x)
-        rest = chosen(problem.sections.rest, kind.free)
+        rest = free_components(problem.sections.rest, kind.free)
         return zero._replace(xi=rest), problem.at_rest()
 
     root = implicit_root(find, imbalance, linear_solve, at_rest, problem)
     return root._replace(x=whole(root.x, problem))
 
 
-def _start(problem: Problem, kind: Kind) -> Unknown:
+def _start(problem: ArmProblem, kind: Kind) -> ArmUnknown:
     """Balance of each section alone, without loads, cables slack and without friction, in single
     precision."""
     tension = (jnp.zeros_like(problem.grid.h[0]),) * len(kind.cables)
@@ -78,7 +85,7 @@ def _start(problem: Problem, kind: Kind) -> Unknown:
         jnp.where(sound, x.astype(x0.dtype), x0) for x, x0 in zip(alone.xi, rest, strict=True)
     )
     xi = with_locked(xi, rest, kind.free)  # these are never corrected
-    return Unknown(xi, tension, (jnp.zeros_like(xi[0]),) * len(kind.frictional))
+    return ArmUnknown(xi, tension, (jnp.zeros_like(xi[0]),) * len(kind.frictional))
 
 
 class _Sizes(NamedTuple):
@@ -94,7 +101,7 @@ class _Sizes(NamedTuple):
     def length(self) -> Array:
         return jnp.sum(self.grid.h, axis=0)
 
-    def of_step(self, step: Unknown, at: State) -> Array:
+    def of_step(self, step: ArmUnknown, at: ArmState) -> Array:
         """Largest change of the shape, of what a tension does to it, or of what friction takes of
         one."""
         step = cast(step, self.grid.h.dtype)
@@ -105,7 +112,7 @@ class _Sizes(NamedTuple):
         moved = self._largest(shape_size(step.xi, self.length))
         return sum((self._largest(x) for x in (*tensions, *self._rubbed(step.turning, at))), moved)
 
-    def of_imbalance(self, imbalance: Imbalance, at: State) -> Array:
+    def of_imbalance(self, imbalance: ArmImbalance, at: ArmState) -> Array:
         """Root of the mean square of all rows; a cable's is its slack by the arm's length."""
         wrench = spread(imbalance.wrench, self.kind.free)
         bent = shape_of(wrench, self.sections.stiffness, self.length)
@@ -117,19 +124,20 @@ class _Sizes(NamedTuple):
         )
         return jnp.sqrt(sum((jnp.mean(x**2, axis=self._inner(x)) for x in others), square))
 
-    def turn(self, step: Unknown) -> Array:
+    def turn(self, step: ArmUnknown) -> Array:
         """How far the step bends and twists the arm in all [rad]."""
         x, y, z = (jnp.abs(k) for k in cast(step.xi[:3], self.grid.h.dtype))
         return jnp.sum(self.grid.weight * (x + y + z), axis=(0, 1))
 
-    def work(self, wrench: Vector, step: Unknown) -> Array:
+    def work(self, wrench: Vector, step: ArmUnknown) -> Array:
         """Work of the imbalance over a step; only its sign and its rough size matter."""
         work = jnp.sum(
-            c.single(self.grid.weight) * c.dot(wrench, chosen(step.xi, self.kind.free)), axis=(0, 1)
+            c.single(self.grid.weight) * c.dot(wrench, free_components(step.xi, self.kind.free)),
+            axis=(0, 1),
         )
         return work.astype(self.grid.h.dtype)
 
-    def _rubbed(self, rates: Vector, at: State) -> list[Array]:
+    def _rubbed(self, rates: Vector, at: ArmState) -> list[Array]:
         """Changes of turning rates by what they make of the tensions."""
         pulls = [pull_of(self.sections, place, self.length) for place in self.kind.frictional]
         return [
@@ -144,14 +152,14 @@ class _Sizes(NamedTuple):
         return jnp.max(jnp.abs(x), axis=self._inner(x))
 
 
-def _solve(kind: Kind, start: Unknown, whole: Problem) -> Root:
+def _solve(kind: Kind, start: ArmUnknown, whole: ArmProblem) -> Root:
     arms = arms_in((start, whole), whole.grid.h.ndim - 1)
     start = jax.tree.map(
         lambda x: jnp.broadcast_to(x, (*x.shape[: x.ndim - len(arms)], *arms)), start
     )
     sizes = _Sizes(whole.grid, whole.sections, kind, arms)
 
-    def evaluate(unknown: Unknown, damping: Array, share: Array) -> Damped:
+    def evaluate(unknown: ArmUnknown, damping: Array, share: Array) -> Damped:
         problem = whole.with_share(share)
         at = state_of(unknown, problem, kind)
         imbalance = imbalance_of(unknown, at, problem, kind)

@@ -12,8 +12,8 @@ from jaxtyping import Array
 from ..numerics import component as c, lu
 from ..numerics.component import Vector
 from ..typing import cast
-from .arm_balance import Imbalance, Kind, Problem, State, Unknown, state_of
-from .balance import chosen, spread, tangent, thread_direction, thread_wrench
+from .arm_balance import ArmImbalance, ArmProblem, ArmState, ArmUnknown, Kind, state_of
+from .balance import free_components, spread, tangent, thread_direction, thread_wrench
 from .elimination import eliminate
 
 _REFINEMENTS = 60
@@ -28,13 +28,13 @@ epsilons."""
 
 
 def approximate_solve(
-    unknown: Unknown,
-    at: State,
-    right: Imbalance,
-    problem: Problem,
+    unknown: ArmUnknown,
+    at: ArmState,
+    right: ArmImbalance,
+    problem: ArmProblem,
     kind: Kind,
     damping: Array | float = 0.0,
-) -> tuple[Unknown, Array]:
+) -> tuple[ArmUnknown, Array]:
     """Solution of the tangent system, nearly (see `elimination`; friction's own tangent is left
     out), and whether it is definite for the changes of shape that taut cables allow.
 
@@ -55,7 +55,7 @@ def approximate_solve(
 
     strain, negative = solve(spread(right.wrench, kind.free))
     if not kind.cables:
-        return Unknown(strain, (), right.turning), negative == 0
+        return ArmUnknown(strain, (), right.turning), negative == 0
     units = [
         thread_wrench(thread_direction(unknown.xi, sections.paths[i])[0], sections.paths[i])
         for i in kind.cables
@@ -74,14 +74,14 @@ def approximate_solve(
         a - jnp.sum(tension[:, None, None] * answer, axis=0)
         for a, answer in zip(strain, answers, strict=True)
     )
-    return Unknown(strain, tuple(tension), right.turning), negative == held
+    return ArmUnknown(strain, tuple(tension), right.turning), negative == held
 
 
 def _tensions(
-    unknown: Unknown,
-    at: State,
-    right: Imbalance,
-    problem: Problem,
+    unknown: ArmUnknown,
+    at: ArmState,
+    right: ArmImbalance,
+    problem: ArmProblem,
     kind: Kind,
     shortening: Array,
     given: Array,
@@ -111,8 +111,8 @@ def _tensions(
 
 
 def tangent_solve(
-    apply: Callable, unknown: Unknown, problem: Problem, right: Imbalance, kind: Kind
-) -> Unknown:
+    apply: Callable, unknown: ArmUnknown, problem: ArmProblem, right: ArmImbalance, kind: Kind
+) -> ArmUnknown:
     r"""Solution of the exact tangent system $A x = b$, with `approximate_solve` as preconditioner;
     NaN where it is not found. Of the strains the free ones only.
 
@@ -127,7 +127,7 @@ def tangent_solve(
     _, unravel_change = ravel_pytree(_free_part(unknown, kind))
     to_row, to_change = lax.stop_gradient(_units(problem, kind, right))
 
-    def nearly(b: Imbalance) -> Unknown:
+    def nearly(b: ArmImbalance) -> ArmUnknown:
         step, _ = approximate_solve(unknown, at, b, problem, kind)
         return _free_part(cast(step, problem.grid.h.dtype), kind)
 
@@ -153,24 +153,24 @@ def tangent_solve(
     )
 
 
-def _free_part(unknown: Unknown, kind: Kind) -> Unknown:
-    return unknown._replace(xi=chosen(unknown.xi, kind.free))
+def _free_part(unknown: ArmUnknown, kind: Kind) -> ArmUnknown:
+    return unknown._replace(xi=free_components(unknown.xi, kind.free))
 
 
-def _units(problem: Problem, kind: Kind, like: Imbalance) -> tuple[Array, Array]:
+def _units(problem: ArmProblem, kind: Kind, like: ArmImbalance) -> tuple[Array, Array]:
     """What makes rows of the residual, and changes of the unknowns from their scaled ones, those of
     the scaled system."""
     stiffness, weight = problem.sections.stiffness, problem.grid.weight
     weight = jnp.maximum(weight, 1e-6 * jnp.max(weight))  # that of an empty step is 0
-    root = tuple(jnp.sqrt(weight * s) for s in chosen(stiffness, kind.free))
+    root = tuple(jnp.sqrt(weight * s) for s in free_components(stiffness, kind.free))
     turn = jnp.sqrt(weight * jnp.minimum(stiffness[1], stiffness[2]))
     tension = tuple(jnp.sqrt(cable.scale) for cable in problem.cables)
-    rows = Imbalance(
+    rows = ArmImbalance(
         tuple(weight / x for x in root),
         tuple(1 / x for x in tension),
         (turn,) * len(kind.frictional),
     )
-    changes = Imbalance(tuple(1 / x for x in root), tension, (1 / turn,) * len(kind.frictional))
+    changes = ArmImbalance(tuple(1 / x for x in root), tension, (1 / turn,) * len(kind.frictional))
     row, change = (
         ravel_pytree(jax.tree.map(lambda x, y: jnp.broadcast_to(x, y.shape), tree, like))[0]
         for tree in (rows, changes)

@@ -151,12 +151,12 @@ def without_force(tau: Vector) -> Vector:
     return tuple(jnp.zeros_like(force) for force in tau)
 
 
-def chosen(vector: Vector, free: tuple[int, ...]) -> Vector:
+def free_components(vector: Vector, free: tuple[int, ...]) -> Vector:
     """Components of the free strains."""
     return tuple(vector[i] for i in free)
 
 
-def chosen_rows(lower: Matrix, free: tuple[int, ...]) -> Matrix:
+def free_block(lower: Matrix, free: tuple[int, ...]) -> Matrix:
     """Lower triangle of a symmetric matrix that belongs to the free strains."""
     return tuple(tuple(lower[i][j] for j in free if j <= i) for i in free)
 
@@ -196,8 +196,8 @@ def newton_step(
     The tangent is factored in single precision, at half the cost: of a small step only its first
     digits matter.
     """
-    r = chosen(residual(xi, sections, tau, reaction), free)
-    factor = cholesky(chosen_rows(tangent(*single((xi, sections, tau))), free))
+    r = free_components(residual(xi, sections, tau, reaction), free)
+    factor = cholesky(free_block(tangent(*single((xi, sections, tau))), free))
     step = cholesky_solve(factor, single(r))
     return r, tuple(s.astype(x.dtype) for s, x in zip(step, r, strict=True))
 
@@ -225,7 +225,9 @@ def solve_balance(
     def imbalance(
         x: Vector, sections: CrossSections, tau: Vector, reaction: Vector | None, _: Vector | None
     ) -> Vector:
-        return chosen(residual(completed(x, sections.rest, free), sections, tau, reaction), free)
+        return free_components(
+            residual(completed(x, sections.rest, free), sections, tau, reaction), free
+        )
 
     def linear_solve(
         x: Vector, sections: CrossSections, tau: Vector, *others: Vector | None
@@ -233,10 +235,10 @@ def solve_balance(
         *_, right = others
         assert right is not None
         lower = tangent(completed(x, sections.rest, free), sections, tau)
-        return cholesky_solve(cholesky(chosen_rows(lower, free)), right)
+        return cholesky_solve(cholesky(free_block(lower, free)), right)
 
     def at_rest(x: Vector, sections: CrossSections, tau: Vector, *others: Vector | None) -> tuple:
-        return chosen(sections.rest, free), sections, without_force(tau), *others
+        return free_components(sections.rest, free), sections, without_force(tau), *others
 
     root = implicit_root(
         partial(_find_balance, free),
@@ -273,14 +275,14 @@ def _find_balance(
 
     def evaluate(xi: Vector) -> Evaluation:
         r, step = newton_step(xi, sections, tau, reaction, free)
-        elastic = multiply(chosen(compliance, free), r)
+        elastic = multiply(free_components(compliance, free), r)
         definite = ~jnp.isnan(step[-1])
         step = tuple(jnp.where(definite, x, e) for x, e in zip(step, elastic, strict=True))
-        size = jnp.sqrt(dot(step, multiply(chosen(stiffness, free), step)) * per_force)
+        size = jnp.sqrt(dot(step, multiply(free_components(stiffness, free), step)) * per_force)
         return Evaluation(spread(step, free), size, jnp.sqrt(dot(r, elastic) * per_force), definite)
 
     first = rest if start is None else with_locked(start, rest, free)
     xi, definite, steps = newton(evaluate, first, floor)
-    imbalance = spread(chosen(residual(xi, sections, tau, reaction), free), free)
+    imbalance = spread(free_components(residual(xi, sections, tau, reaction), free), free)
     balanced = strain_norm(imbalance, stiffness) <= 16 * floor
-    return Root(chosen(xi, free), balanced, definite, steps)
+    return Root(free_components(xi, free), balanced, definite, steps)

@@ -27,7 +27,7 @@ from jaxtyping import Array
 from ..numerics import component as c
 from ..numerics.component import Matrix, Vector
 from ..numerics.quadrature import Grid
-from .balance import chosen, chosen_rows, spread
+from .balance import free_block, free_components, spread
 from .reaction import Loading, Reaction, turned
 
 UNSTABLE_SECTION = 1_000_000
@@ -35,7 +35,7 @@ UNSTABLE_SECTION = 1_000_000
 cables can hold."""
 
 
-class Cell(NamedTuple):
+class EliminationCell(NamedTuple):
     r"""What the elimination knows of one node before it comes to it, in the frame of its section.
 
     - `width` w; `turn`: rotation of the next node's section as seen from here;
@@ -63,7 +63,7 @@ class Cell(NamedTuple):
     jump: Vector | None = None
 
 
-class Linear(NamedTuple):
+class EliminatedLinear(NamedTuple):
     r"""The linear strains of a node once its rotations are known: `flexibility` $(\delta n$ +
     `by_theta` $\theta$ + `right`) $-$ `by_bend` $\kappa$, with $\delta n$ the part of the force
     that P makes."""
@@ -95,7 +95,7 @@ def eliminate(
     may be anything.
     """
     if along is None or loads is None or min(free) > 2:
-        x = c.cholesky_solve(c.cholesky(chosen_rows(lower, free)), chosen(right, free))
+        x = c.cholesky_solve(c.cholesky(free_block(lower, free)), free_components(right, free))
         return spread(x, free), jnp.where(
             jnp.any(jnp.isnan(x[-1]), axis=(0, 1)), UNSTABLE_SECTION, 0
         ).astype(jnp.int32)
@@ -149,7 +149,7 @@ def _cells(
     loads: Loading,
     w: Array,
     free: tuple[int, ...],
-) -> tuple[Cell, Linear, Array]:
+) -> tuple[EliminationCell, EliminatedLinear, Array]:
     """All that does not depend on P, for all nodes at once, and whether nothing is unstable yet."""
     half, density = 0.5 * w, loads.follower_density
     m, n, u = c.skew(wrench[:3]), c.skew(wrench[3:]), c.skew(xi[3:])
@@ -185,7 +185,7 @@ def _cells(
     )
     compliance, stable = _inverse(stiff, tuple(i for i in free if i < 3))
     lever = c.scale(-w, n)  # the moment over the cell that a linear strain makes
-    cell = Cell(
+    cell = EliminationCell(
         w,
         _turns(rotation),
         compliance,
@@ -198,7 +198,7 @@ def _cells(
     if loads.follows:
         by_push, stretch = c.scale(-1.0, c.matmul(compliance, D)), c.matmul(lever, flexibility)
         cell = cell._replace(by_push=by_push, stretch=stretch, axis=xi[3:], force=force)
-    return cell, Linear(flexibility, by_force, right[3:], by_bend), rigid & stable
+    return cell, EliminatedLinear(flexibility, by_force, right[3:], by_bend), rigid & stable
 
 
 def _inverse(matrix: Matrix, places: tuple[int, ...]) -> tuple[Matrix, Array]:
@@ -259,7 +259,7 @@ def _jumps(along: Reaction, loads: Loading, grid: Grid) -> Vector | None:
     return None if total is None else turned(c.transpose(along.rotation), total)
 
 
-def _cell(end: tuple[Matrix, Vector], cell: Cell) -> tuple[tuple[Matrix, Vector], tuple]:
+def _cell(end: tuple[Matrix, Vector], cell: EliminationCell) -> tuple[tuple[Matrix, Vector], tuple]:
     r"""One cell from its end to its start: P and p there, and the bend as $X \theta + x$ of the
     rotation at its start."""
     P, p = _seen_from_here(*end, cell)
@@ -298,7 +298,7 @@ def _cell(end: tuple[Matrix, Vector], cell: Cell) -> tuple[tuple[Matrix, Vector]
     return (start, start_p), (X, x, (P[3:], p[3:]), negative)
 
 
-def _seen_from_here(P: Matrix, p: Vector, cell: Cell) -> tuple[Matrix, Vector]:
+def _seen_from_here(P: Matrix, p: Vector, cell: EliminationCell) -> tuple[Matrix, Vector]:
     """P and p of the next cell's start in the frame of this one's node, the follower wrench between
     them included."""
     T, like = cell.turn, p[0]
@@ -309,7 +309,7 @@ def _seen_from_here(P: Matrix, p: Vector, cell: Cell) -> tuple[Matrix, Vector]:
     return c.keep((P, p), like)
 
 
-def _carried(P: Matrix, p: Vector, cell: Cell, part: float) -> tuple[Matrix, Vector]:
+def _carried(P: Matrix, p: Vector, cell: EliminationCell, part: float) -> tuple[Matrix, Vector]:
     """The end's change of the wrench at a part of the cell before it: the change of the force has
     an arm."""
     if cell.axis is None:

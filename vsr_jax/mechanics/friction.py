@@ -21,7 +21,7 @@ from ..arm.scene import CrossSections
 from ..numerics import component as c
 from ..numerics.component import Vector
 from ..numerics.quadrature import Grid, beyond, interpolation, locate, weighted, within
-from .balance import actuation_wrench, chosen, chosen_rows, completed, residual, tangent
+from .balance import actuation_wrench, completed, free_block, free_components, residual, tangent
 
 
 class Friction(NamedTuple):
@@ -96,7 +96,7 @@ def kinks_of(
     return jnp.concatenate([jnp.zeros_like(angle[:1]), angle])
 
 
-def strain_rate(
+def balanced_strain_rate(
     xi: Vector,
     tau: Vector,
     tau_rate: Vector,
@@ -118,8 +118,8 @@ def strain_rate(
     change = jax.jvp(imbalance, *_alike((sections,), (rate,)))[1]
     right = c.subtract(actuation_wrench(xi, sections, tau_rate), change)
     right = right if reaction_rate is None else c.add(right, reaction_rate)
-    factor = c.cholesky(chosen_rows(tangent(xi, sections, tau), free))
-    return completed(c.cholesky_solve(factor, chosen(right, free)), rate.rest, free)
+    factor = c.cholesky(free_block(tangent(xi, sections, tau), free))
+    return completed(c.cholesky_solve(factor, free_components(right, free)), rate.rest, free)
 
 
 def _alike(values: tuple, rates: tuple) -> tuple[Any, Any]:

@@ -29,7 +29,7 @@ from ..numerics.se3 import coad, hat, inverse
 from ..typing import Pose, Scalar, Twist
 from ..validation import count, instance, positive
 from .base import Model, Nodes, Outcome, Status, classify
-from .shooting import Control, Guess, Line, Shot, Unknown, integrate, shoot
+from .shooting import Control, Guess, Line, ShootingUnknown, Shot, integrate, shoot
 from .strain_dependent import StrainDependent
 
 
@@ -40,7 +40,7 @@ class Found(NamedTuple):
     inputs: Array
 
 
-def strain_rate(scene: Scene, tau: Vector, xi: Twist, X: Scalar) -> Twist:
+def cosserat_strain_rate(scene: Scene, tau: Vector, xi: Twist, X: Scalar) -> Twist:
     r"""Right side of eq. (12): $\xi' = (\Sigma - A)^{-1} (a - b - c)$.
 
     With $r = F_i - F_a$ the balance (8) is $r' + \mathrm{ad}^*_\xi r = 0$, and $r' = H \xi' +
@@ -234,7 +234,7 @@ def _shoot(model: Continuum, scene: Scene, inputs: Array) -> tuple[Shot, Guess, 
     loads = loading(scene, grid)
     zero = jnp.zeros_like(segments.start)
     wrench = (zero,) * 6 if loads is None else react_at(found.state.xi, grid, loads, segments.start)
-    first = Unknown(
+    first = ShootingUnknown(
         steps.poses(scene, found.forces, found.state, segments.start)[:, :3, :3], c.join(wrench)
     )
     control = model._control(grid.h.dtype)
@@ -283,7 +283,7 @@ def _integrate(
     tau = forces_where(sound, tau)
 
     def field(x: Any, line: Line, _: None) -> Line:
-        return Line(strain_rate(scene, tau, line.xi, x), line.g @ hat(line.xi))
+        return Line(cosserat_strain_rate(scene, tau, line.xi, x), line.g @ hat(line.xi))
 
     control = model._control(xi.dtype)
     solution = diffrax.diffeqsolve(

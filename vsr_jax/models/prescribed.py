@@ -163,7 +163,7 @@ class Prescribed(SteppedModel):
         sound = status == Status.CONVERGED
         return Outcome(jnp.where(sound, q, 0.0), forces_where(sound, forces), status, steps)
 
-    def _at_nodes(self, scene: Scene, grid: Grid) -> prescribed_loaded.Basis:
+    def _at_nodes(self, scene: Scene, grid: Grid) -> prescribed_loaded.NodalBasis:
         X = grid.X.reshape(-1)
 
         def at(x: Scalar) -> Array:
@@ -174,7 +174,7 @@ class Prescribed(SteppedModel):
 
         matrix, rate = jax.vmap(with_rate)(X) if scene.frictional else (jax.vmap(at)(X), None)
         shape = (*grid.X.shape, 6, self.basis.size)
-        return prescribed_loaded.Basis(
+        return prescribed_loaded.NodalBasis(
             matrix.reshape(shape), None if rate is None else rate.reshape(shape)
         )
 

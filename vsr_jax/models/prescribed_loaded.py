@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..arm.scene import shared
-from ..mechanics.arm_balance import Kind, Problem, pull_of, rounding_of, with_tensions
+from ..mechanics.arm_balance import ArmProblem, Kind, pull_of, rounding_of, with_tensions
 from ..mechanics.balance import (
     largest_force_scale,
     residual,
@@ -35,14 +35,14 @@ from ..numerics.newton import LOAD_SHARES, MOST_TURN, Damped, Root, damped_newto
 from ..numerics.quadrature import Grid
 
 
-class Unknown(NamedTuple):
+class GalerkinUnknown(NamedTuple):
     """Coordinates, and tension [N] of each cable."""
 
     q: Float[Array, "dofs *arms"]
     tension: Float[Array, "cables *arms"]
 
 
-class Basis(NamedTuple):
+class NodalBasis(NamedTuple):
     r"""The basis at the nodes, $B_q$, shape (stages, steps, 6, n), and its change along the arm
     (None without friction)."""
 
@@ -50,7 +50,7 @@ class Basis(NamedTuple):
     rate: Array | None
 
 
-class At(NamedTuple):
+class GalerkinState(NamedTuple):
     """What follows from the unknowns: strain at the nodes, share of each thread's force there, its
     force, the reaction, and the slack of each cable [m]."""
 
@@ -61,7 +61,7 @@ class At(NamedTuple):
     slack: Vector
 
 
-def strain(q: Array, basis: Basis, problem: Problem) -> Vector:
+def strain(q: Array, basis: NodalBasis, problem: ArmProblem) -> Vector:
     r"""Strain at the nodes, $\xi = B_q q + \xi^*$."""
     return c.add(_combined(basis.matrix, q), problem.sections.rest)
 
@@ -86,7 +86,7 @@ def _gathered(matrix: Array, wrenches: Vector, grid: Grid) -> Array:
 
 
 def shares(
-    xi: Vector, q: Array, basis: Basis, problem: Problem, kind: Kind
+    xi: Vector, q: Array, basis: NodalBasis, problem: ArmProblem, kind: Kind
 ) -> tuple[Array | None, ...]:
     """Share of each thread's force at the nodes."""
     shares = list(problem.sections.reach)
@@ -101,7 +101,9 @@ def shares(
     return tuple(shares)
 
 
-def state_of(unknown: Unknown, basis: Basis, problem: Problem, kind: Kind) -> At:
+def state_of(
+    unknown: GalerkinUnknown, basis: NodalBasis, problem: ArmProblem, kind: Kind
+) -> GalerkinState:
     """What follows from the unknowns."""
     grid, xi = problem.grid, strain(unknown.q, basis, problem)
     share = shares(xi, unknown.q, basis, problem, kind)
@@ -111,10 +113,12 @@ def state_of(unknown: Unknown, basis: Basis, problem: Problem, kind: Kind) -> At
         cable.slack(tension, path_length(xi, problem.sections, place, grid), share[place], grid)
         for place, cable, tension in zip(kind.cables, problem.cables, unknown.tension, strict=True)
     )
-    return At(xi, share, tau, along, slack)
+    return GalerkinState(xi, share, tau, along, slack)
 
 
-def imbalance(unknown: Unknown, at: At, basis: Basis, problem: Problem) -> Unknown:
+def imbalance(
+    unknown: GalerkinUnknown, at: GalerkinState, basis: NodalBasis, problem: ArmProblem
+) -> GalerkinUnknown:
     """Residual: generalised force, and for each cable the lesser of tension and scaled slack
     [N]."""
     r = residual(at.xi, problem.sections, at.tau, None if at.along is None else at.along.wrench)
@@ -122,13 +126,13 @@ def imbalance(unknown: Unknown, at: At, basis: Basis, problem: Problem) -> Unkno
         cable.complementarity(tension, slack)
         for cable, tension, slack in zip(problem.cables, unknown.tension, at.slack, strict=True)
     ]
-    return Unknown(
+    return GalerkinUnknown(
         _projected(basis.matrix, r, problem.grid), jnp.stack(rows) if rows else unknown.tension
     )
 
 
 def approximate_tangent(
-    unknown: Unknown, at: At, basis: Basis, problem: Problem, kind: Kind
+    unknown: GalerkinUnknown, at: GalerkinState, basis: NodalBasis, problem: ArmProblem, kind: Kind
 ) -> Array:
     """Derivative of the residual, friction's own part left out, to the order of the nodes'
     quadrature and in single precision."""
@@ -194,17 +198,17 @@ class _Sizes(NamedTuple):
         """Root of the mean square of a change of shape along the arm."""
         return jnp.sqrt(jnp.maximum(jnp.sum(q * jnp.sum(self.gram * q, axis=1), axis=0), 0.0))
 
-    def of_step(self, step: Unknown) -> Array:
+    def of_step(self, step: GalerkinUnknown) -> Array:
         """Size of a change of the unknowns."""
         return self.turn(step.q) + jnp.sum(self.pulls * jnp.abs(step.tension), axis=0)
 
-    def of_imbalance(self, r: Unknown) -> Array:
+    def of_imbalance(self, r: GalerkinUnknown) -> Array:
         """Size of the change that an imbalance makes of an arm at rest."""
         square = self.turn(lu.substitute(self.factors, r.q)) ** 2
         return jnp.sqrt(square + jnp.sum((r.tension / self.axial) ** 2, axis=0))
 
 
-def _sizes_of(basis: Basis, K: Array, problem: Problem, kind: Kind) -> _Sizes:
+def _sizes_of(basis: NodalBasis, K: Array, problem: ArmProblem, kind: Kind) -> _Sizes:
     grid, sections = problem.grid, problem.sections
     length = jnp.sum(grid.h, axis=0)
     gram = [
@@ -224,34 +228,38 @@ def _by_strain(matrix: Array, length: Array) -> list[tuple[Array, Array | float]
     return [(matrix[:, :, i], length**2 if i < 3 else 1.0) for i in range(6)]
 
 
-def solve_prescribed(basis: Basis, problem: Problem, kind: Kind) -> Root:
-    """Equilibrium in the basis, by damped Newton steps from rest. Its point is an `Unknown`.
-    Derivatives are implicit, of any order."""
+def solve_prescribed(basis: NodalBasis, problem: ArmProblem, kind: Kind) -> Root:
+    """Equilibrium in the basis, by damped Newton steps from rest; its point is a `GalerkinUnknown`.
 
-    def row(unknown: Unknown, basis: Basis, problem: Problem) -> Array:
+    Derivatives are implicit, of any order, in forward and reverse mode.
+    """
+
+    def row(unknown: GalerkinUnknown, basis: NodalBasis, problem: ArmProblem) -> Array:
         """Residual in a row."""
         return jnp.concatenate(
             imbalance(unknown, state_of(unknown, basis, problem, kind), basis, problem)
         )
 
-    def linear_solve(unknown: Unknown, basis: Basis, problem: Problem, right: Array) -> Unknown:
+    def linear_solve(
+        unknown: GalerkinUnknown, basis: NodalBasis, problem: ArmProblem, right: Array
+    ) -> GalerkinUnknown:
         split = partial(_split, size=unknown.q.size)
         J = jax.jacfwd(lambda z: row(split(z), basis, problem))(jnp.concatenate(unknown))
         return split(lu.solve(J, right))
 
-    def at_rest(unknown: Unknown, basis: Basis, problem: Problem) -> tuple:
+    def at_rest(unknown: GalerkinUnknown, basis: NodalBasis, problem: ArmProblem) -> tuple:
         return jax.tree.map(jnp.zeros_like, unknown), basis, problem.at_rest()
 
     find = side_by_side(partial(_solve, kind))
     return implicit_root(find, row, linear_solve, at_rest, basis, problem)
 
 
-def _split(z: Array, size: int) -> Unknown:
+def _split(z: Array, size: int) -> GalerkinUnknown:
     """Coordinates and tensions from a row of both."""
-    return Unknown(z[:size], z[size:])
+    return GalerkinUnknown(z[:size], z[size:])
 
 
-def _solve(kind: Kind, basis: Basis, problem: Problem) -> Root:
+def _solve(kind: Kind, basis: NodalBasis, problem: ArmProblem) -> Root:
     stiffness = problem.sections.stiffness
     behind = problem.grid.h.ndim - 1
     arms = arms_in((basis, problem), behind)
@@ -264,7 +272,7 @@ def _solve(kind: Kind, basis: Basis, problem: Problem) -> Root:
     sizes = _sizes_of(basis, K, problem, kind)
     size = K.shape[0]
 
-    def evaluate(unknown: Unknown, damping: Array, share: Array) -> Damped:
+    def evaluate(unknown: GalerkinUnknown, damping: Array, share: Array) -> Damped:
         part = problem.with_share(share)
         at = state_of(unknown, basis, part, kind)
         r = imbalance(unknown, at, basis, part)
@@ -282,10 +290,10 @@ def _solve(kind: Kind, basis: Basis, problem: Problem) -> Root:
             jax.tree.map(lambda x: cut * x, step), moved, r.q, sizes.of_imbalance(r), definite
         )
 
-    def work(force: Array, step: Unknown) -> Array:
+    def work(force: Array, step: GalerkinUnknown) -> Array:
         return jnp.sum(force * step.q, axis=0)
 
-    start = Unknown(
+    start = GalerkinUnknown(
         jnp.zeros((size, *arms), K.dtype), jnp.zeros((len(kind.cables), *arms), K.dtype)
     )
     floor = jnp.broadcast_to(rounding_of(problem), arms)

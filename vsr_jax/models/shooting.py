@@ -24,7 +24,7 @@ from jaxtyping import Array
 from ..arm.scene import CrossSections, Scene, shared
 from ..mechanics.arm_balance import shares_at
 from ..mechanics.balance import residual, solve_balance
-from ..mechanics.friction import reaction_rate, strain_rate
+from ..mechanics.friction import balanced_strain_rate, reaction_rate
 from ..numerics import component as c
 from ..numerics.component import Vector
 from ..numerics.quadrature import Grid
@@ -44,7 +44,7 @@ class Guess(NamedTuple):
     turning: Vector
 
 
-class Unknown(NamedTuple):
+class ShootingUnknown(NamedTuple):
     """Rotation (3, 3) and reaction (6,) at the start of each segment."""
 
     rotation: Array
@@ -74,7 +74,7 @@ class Shot(NamedTuple):
     steps."""
 
     segments: Grid
-    unknown: Unknown
+    unknown: ShootingUnknown
     poses: Array
     fits: Array
     steps: Array
@@ -106,7 +106,7 @@ def integrate(
         xi = c.split(line.xi)
         wrench = residual(xi, sections, tau)
         density = _body_density(scene, x, rotation @ line.g[:3, :3])
-        xi_rate = strain_rate(
+        xi_rate = balanced_strain_rate(
             xi, tau, rate[2], reaction_rate(xi, wrench, density), sections, rate[1], free
         )
         return Line(h * c.join(xi_rate), h * (line.g @ hat(line.xi)))
@@ -148,7 +148,12 @@ def _body_density(scene: Scene, X: Array, rotation: Array) -> Vector:
 
 
 def shoot(
-    scene: Scene, guess: Guess, first: Unknown, segments: Grid, control: Control, tolerance: float
+    scene: Scene,
+    guess: Guess,
+    first: ShootingUnknown,
+    segments: Grid,
+    control: Control,
+    tolerance: float,
 ) -> Shot:
     """Rotations and reactions at the start of the segments with which they fit together."""
 
@@ -172,8 +177,10 @@ def shoot(
     def turned(R: Array, k: Array) -> Array:
         return R @ c.join_matrix(rotation_components(c.split(k)))
 
-    def place(z: Array) -> Unknown:
-        return Unknown(jax.vmap(turned)(first.rotation, z[:, :3]), first.reaction + z[:, 3:])
+    def place(z: Array) -> ShootingUnknown:
+        return ShootingUnknown(
+            jax.vmap(turned)(first.rotation, z[:, :3]), first.reaction + z[:, 3:]
+        )
 
     def misfit(z: Array, ends: Array) -> Array:
         return _misfit(scene, place(z), ends, segments) / scale
@@ -218,7 +225,7 @@ def shoot(
     )
 
 
-def _scale(scene: Scene, first: Unknown, count: int) -> Array:
+def _scale(scene: Scene, first: ShootingUnknown, count: int) -> Array:
     """Sizes of the unknowns of each segment: a radian, and the reaction or what bends the arm by a
     radian if that is more."""
     length = scene.rod.length
@@ -230,7 +237,7 @@ def _scale(scene: Scene, first: Unknown, count: int) -> Array:
     return jnp.broadcast_to(jnp.concatenate([jnp.ones_like(size[:3]), size]), (count, 9))
 
 
-def _misfit(scene: Scene, unknown: Unknown, ends: Array, segments: Grid) -> Array:
+def _misfit(scene: Scene, unknown: ShootingUnknown, ends: Array, segments: Grid) -> Array:
     """What is wrong at the start of each segment: rotation (3) against the one before, reaction (6)
     at its end against the next."""
     base = base_pose(scene.rod.base, ends.dtype)[:3, :3]

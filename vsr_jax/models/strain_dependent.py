@@ -11,7 +11,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..arm.scene import Scene, shared
-from ..mechanics.arm_balance import Unknown, problem_of, shares_at, state_of, with_tensions
+from ..mechanics.arm_balance import ArmUnknown, problem_of, shares_at, state_of, with_tensions
 from ..mechanics.arm_solve import solve_arm
 from ..mechanics.balance import forces_where, newton_step, solve_balance, spread
 from ..mechanics.reaction import loading, react_at
@@ -53,7 +53,7 @@ class StrainDependent(SteppedModel):
         status = jnp.where(
             status == Status.CONVERGED, _status_of_ends(scene, forces, solution.xi), status
         )
-        state = Unknown(rest_where_failed(status, solution.xi, sections), (), ())
+        state = ArmUnknown(rest_where_failed(status, solution.xi, sections), (), ())
         return Outcome(state, forces, status, solution.steps)
 
     def _solve_together(self, scene: Scene, inputs: Float[Array, " inputs"]) -> Outcome:
@@ -66,12 +66,14 @@ class StrainDependent(SteppedModel):
         sound = status == Status.CONVERGED
         forces = forces_where(sound, with_tensions(problem.forces, unknown.tension, kind))
         xi = rest_where_failed(status, unknown.xi, problem.sections)
-        return Outcome(Unknown(xi, (), forces_where(sound, unknown.turning)), forces, status, steps)
+        return Outcome(
+            ArmUnknown(xi, (), forces_where(sound, unknown.turning)), forces, status, steps
+        )
 
-    def node_strain(self, scene: Scene, state: Unknown) -> Vector:
+    def node_strain(self, scene: Scene, state: ArmUnknown) -> Vector:
         return state.xi
 
-    def nodes(self, scene: Scene, forces: Vector, state: Unknown) -> Nodes:
+    def nodes(self, scene: Scene, forces: Vector, state: ArmUnknown) -> Nodes:
         grid = self.grid(scene)
         return Nodes(
             grid,
@@ -80,11 +82,11 @@ class StrainDependent(SteppedModel):
             shares_at(scene, state.xi, state.turning, grid, grid.X),
         )
 
-    def coordinates(self, scene: Scene, forces: Vector, state: Unknown) -> Float[Array, " dofs"]:
+    def coordinates(self, scene: Scene, forces: Vector, state: ArmUnknown) -> Float[Array, " dofs"]:
         return jnp.array(forces, state.xi[0].dtype)
 
     def strain(
-        self, scene: Scene, forces: Vector, state: Unknown, X: Float[Array, " stations"]
+        self, scene: Scene, forces: Vector, state: ArmUnknown, X: Float[Array, " stations"]
     ) -> Vector:
         grid = self.grid(scene)
         loads = loading(scene, grid)

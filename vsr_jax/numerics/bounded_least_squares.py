@@ -61,7 +61,7 @@ class _Point(NamedTuple):
     J: Array
 
 
-class _State(NamedTuple):
+class _Search(NamedTuple):
     """Where the search is: `ahead` is tried next and promises `descent`; before the first step it
     is a start."""
 
@@ -78,7 +78,7 @@ class _State(NamedTuple):
     miss: Array
 
 
-def weight(dtype: Any) -> float:
+def last_weight(dtype: Any) -> float:
     """The last weight above zero."""
     return float(jnp.finfo(dtype).eps) ** _POWERS[-1]
 
@@ -100,10 +100,10 @@ def nearest(
     still = jnp.asarray([eps**power for power in _STILL], rest.dtype)
     jacobian = jax.jacfwd(lambda s: (f(s),) * 2, has_aux=True)
 
-    def advance(state: _State) -> _State:
+    def advance(state: _Search) -> _Search:
         J, value = jacobian(state.ahead)
         w = weights[state.stage]
-        least = jnp.maximum(w, weight(w.dtype)) ** 2
+        least = jnp.maximum(w, last_weight(w.dtype)) ** 2
         moved = jnp.max(jnp.abs(state.ahead - state.point.s))
         short = (moved <= still[state.stage]) & (state.damping <= least)
         state = _judged(state, _Point(state.ahead, value, J), w, rest)
@@ -111,34 +111,34 @@ def nearest(
         regular = Nearest(
             state.point.s, state.point.s, _free(state.point.s, _slope(state.point, w, rest))
         )
-        found = _chosen(over & (w > 0), regular, state.found)._replace(share=state.point.s)
+        found = _where(over & (w > 0), regular, state.found)._replace(share=state.point.s)
         state = state._replace(found=found, stage=state.stage + over)
-        return _chosen(
+        return _where(
             state.stage == len(weights), _ended(state, starts), _aimed(state, over, weights, rest)
         )
 
-    def pending(state: _State) -> Array:
+    def pending(state: _Search) -> Array:
         return (state.start <= len(starts)) & (state.miss > allowed)
 
     return lax.while_loop(pending, advance, _begun(f, starts, allowed)).best
 
 
-def _chosen(condition: Array, this: Any, that: Any) -> Any:
+def _where(condition: Array, this: Any, that: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), this, that)
 
 
-def _begun(f: Callable[[Array], Array], starts: Array, allowed: Scalar) -> _State:
+def _begun(f: Callable[[Array], Array], starts: Array, allowed: Scalar) -> _Search:
     s, zero = starts[0], jnp.zeros((), jnp.int32)
     size = jax.eval_shape(f, s).size
     point = _Point(s, jnp.zeros(size, s.dtype), jnp.zeros((size, s.size), s.dtype))
     nowhere = Nearest(s, s, jnp.ones(s.shape, bool))
     one, flat = jnp.ones((), s.dtype), jnp.zeros((s.size, s.size), s.dtype)
-    return _State(
+    return _Search(
         point, s, one, flat, one, zero, zero, zero, nowhere, nowhere, jnp.full((), jnp.inf, s.dtype)
     )
 
 
-def _judged(state: _State, trial: _Point, w: Array, rest: Array) -> _State:
+def _judged(state: _Search, trial: _Point, w: Array, rest: Array) -> _Search:
     """The trial taken where it is better, or a start; damping and curvature by what it told."""
     fresh = state.steps == 0
     gain = (_cost(state.point, w, rest) - _cost(trial, w, rest)) / state.descent
@@ -146,17 +146,17 @@ def _judged(state: _State, trial: _Point, w: Array, rest: Array) -> _State:
     factor = jnp.where(better, jnp.where(gain > 0.75, 0.1, jnp.where(gain < 0.25, 3.0, 1.0)), 4.0)
     curvature = jnp.where(better, _updated(state.curvature, state.point, trial), state.curvature)
     return state._replace(
-        point=_chosen(better, trial, state.point),
+        point=_where(better, trial, state.point),
         curvature=jnp.where(fresh, 0.0, curvature),
         damping=jnp.where(fresh, _DAMPING, factor * state.damping),
         steps=state.steps + 1,
     )
 
 
-def _aimed(state: _State, over: Array, weights: Array, rest: Array) -> _State:
+def _aimed(state: _Search, over: Array, weights: Array, rest: Array) -> _Search:
     """The next step; at the beginning of a stage with what is scaled by the weight scaled anew."""
     w, before = weights[state.stage], weights[jnp.maximum(state.stage - 1, 0)]
-    least = jnp.maximum(w, weight(w.dtype)) ** 2
+    least = jnp.maximum(w, last_weight(w.dtype)) ** 2
     curvature = jnp.where(over, (w / before) ** 2, 1.0) * state.curvature
     damping = jnp.maximum(
         jnp.where(over, jnp.minimum(state.damping, least), state.damping), _LEAST * least
@@ -167,7 +167,7 @@ def _aimed(state: _State, over: Array, weights: Array, rest: Array) -> _State:
     )
 
 
-def _ended(state: _State, starts: Array) -> _State:
+def _ended(state: _Search, starts: Array) -> _Search:
     """After the last stage: its result, if it is nearer than those before, and the next start."""
     there = jnp.linalg.norm(state.point.f)
     nearer = there < state.miss
@@ -177,7 +177,7 @@ def _ended(state: _State, starts: Array) -> _State:
         start=start,
         stage=jnp.full_like(state.stage, len(_POWERS) - 1),
         steps=jnp.zeros_like(state.steps),
-        best=_chosen(nearer, state.found, state.best),
+        best=_where(nearer, state.found, state.best),
         miss=jnp.where(nearer, there, state.miss),
     )
 

@@ -60,7 +60,7 @@ class Pairs(NamedTuple):
     vectors: Float[Array, "2 *shape"]
 
 
-class _Basis(NamedTuple):
+class _KrylovBasis(NamedTuple):
     """Lanczos vectors in rows, T by diagonal and subdiagonal, the next vector, how many there are;
     the ends of the spectrum of T, their vectors in the basis and residuals."""
 
@@ -88,15 +88,15 @@ def extreme_pairs(operator: Operator) -> Pairs:
     start = operator.allowed(jnp.asarray(start, operator.like.dtype))
     eps = float(jnp.finfo(start.dtype).eps)
 
-    def unsettled(basis: _Basis, least: float, greatest: float) -> Array:
+    def unsettled(basis: _KrylovBasis, least: float, greatest: float) -> Array:
         return basis.residual > jnp.array([least, greatest], start.dtype) * jnp.maximum(
             1, jnp.abs(basis.values)
         )
 
-    def proceed(basis: _Basis) -> Array:
+    def proceed(basis: _KrylovBasis) -> Array:
         return (basis.filled < basis.alpha.size) & jnp.any(unsettled(basis, eps**0.6, eps**0.4))
 
-    def extend(basis: _Basis) -> _Basis:
+    def extend(basis: _KrylovBasis) -> _KrylovBasis:
         return _with_ritz(
             lax.fori_loop(0, _BETWEEN, lambda _, basis: _one_more(operator, basis), basis)
         )
@@ -110,12 +110,12 @@ def extreme_pairs(operator: Operator) -> Pairs:
     )
 
 
-def _empty(start: Array) -> _Basis:
+def _empty(start: Array) -> _KrylovBasis:
     size = -(-min(start.size, max(_MOST, start.size // 4)) // _BETWEEN) * _BETWEEN
     flat = start.reshape(-1)
     zero, two = jnp.zeros(size, flat.dtype), jnp.zeros(2, flat.dtype)
     unit = flat / jnp.sqrt(jnp.sum(flat**2))
-    return _Basis(
+    return _KrylovBasis(
         jnp.zeros((size, flat.size), flat.dtype),
         zero,
         zero,
@@ -127,7 +127,7 @@ def _empty(start: Array) -> _Basis:
     )
 
 
-def _one_more(operator: Operator, basis: _Basis) -> _Basis:
+def _one_more(operator: Operator, basis: _KrylovBasis) -> _KrylovBasis:
     """One product. Once the basis spans an invariant space the vectors are zero, and T goes on with
     an entry from inside its spectrum."""
     v, j = basis.following, basis.filled
@@ -146,7 +146,7 @@ def _one_more(operator: Operator, basis: _Basis) -> _Basis:
     return basis._replace(rows=rows, alpha=alpha, beta=beta, following=following, filled=j + 1)
 
 
-def _with_ritz(basis: _Basis) -> _Basis:
+def _with_ritz(basis: _KrylovBasis) -> _KrylovBasis:
     """The ends of the spectrum of T, with their vectors and residuals."""
     filled = jnp.arange(basis.alpha.size) < basis.filled
     alpha = jnp.where(

@@ -54,7 +54,7 @@ def make_grid(
     place = np.arange(max(int(steps) if room is None else room, least))
     wanted = max(int(steps), least) if room is None else jnp.maximum(steps, least)
     piece, count, at = (
-        (0, wanted, place) if least == 1 else _share(edges, wanted, jnp.asarray(place))
+        (0, wanted, place) if least == 1 else _distributed(edges, wanted, jnp.asarray(place))
     )
     width = jnp.broadcast_to(jnp.diff(edges)[piece] / count, place.shape)
     start = edges[:-1][piece] + at.astype(width.dtype) * width
@@ -65,7 +65,7 @@ def make_grid(
     return Grid(start, width, start + nodes[:, None] * width, jnp.asarray(weights[:, None] * width))
 
 
-def _share(
+def _distributed(
     edges: Float[Array, " edges"], steps: int | Array, place: Array
 ) -> tuple[Array, Array, Array]:
     """For each step its piece, the number of steps of that piece and its place among them; largest
