@@ -13,7 +13,7 @@ from ..numerics import component as c
 from ..numerics.batching import arms_in, side_by_side
 from ..numerics.component import Vector
 from ..numerics.implicit import implicit_root
-from ..numerics.newton import LOAD_SHARES, MOST_TURN, Damped, Root, damped_newton
+from ..numerics.newton import LOAD_INCREMENTS, MAX_TURN, Damped, Root, damped_newton
 from ..numerics.quadrature import Grid
 from ..typing import cast
 from .arm_balance import (
@@ -166,13 +166,13 @@ def _solve(kind: Kind, start: ArmUnknown, whole: ArmProblem) -> Root:
         step, definite = approximate_solve(unknown, at, imbalance, problem, kind, damping)
         size = sizes.of_step(step, at)
         # A step that coils the arm may well lower the residual, and lead nowhere.
-        cut = jnp.minimum(1.0, MOST_TURN / jnp.maximum(sizes.turn(step), MOST_TURN))
+        cut = jnp.minimum(1.0, MAX_TURN / jnp.maximum(sizes.turn(step), MAX_TURN))
         step = jax.tree.map(lambda x: cut.astype(x.dtype) * x, step)
         return Damped(
             step, size, c.single(imbalance.wrench), sizes.of_imbalance(imbalance, at), definite
         )
 
-    shares = 1 if whole.loads is None else LOAD_SHARES
+    shares = 1 if whole.loads is None else LOAD_INCREMENTS
     return damped_newton(
         evaluate, sizes.work, start, jnp.broadcast_to(rounding_of(whole), arms), shares
     )

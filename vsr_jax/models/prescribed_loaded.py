@@ -31,7 +31,7 @@ from ..numerics import component as c, lu
 from ..numerics.batching import arms_in, side_by_side
 from ..numerics.component import Vector
 from ..numerics.implicit import implicit_root
-from ..numerics.newton import LOAD_SHARES, MOST_TURN, Damped, Root, damped_newton
+from ..numerics.newton import LOAD_INCREMENTS, MAX_TURN, Damped, Root, damped_newton
 from ..numerics.quadrature import Grid
 
 
@@ -281,7 +281,7 @@ def _solve(kind: Kind, basis: NodalBasis, problem: ArmProblem) -> Root:
         step = _split(lu.substitute(factors, jnp.concatenate(c.single(r))).astype(K.dtype), size)
         turn = sizes.turn(step.q)
         moved = sizes.of_step(step)
-        cut = MOST_TURN / jnp.maximum(turn, MOST_TURN)
+        cut = MAX_TURN / jnp.maximum(turn, MAX_TURN)
         falling = (
             lu.diagonal(factors) <= 0
         )  # taut cables hold as many motions as their own rows have such pivots
@@ -297,4 +297,6 @@ def _solve(kind: Kind, basis: NodalBasis, problem: ArmProblem) -> Root:
         jnp.zeros((size, *arms), K.dtype), jnp.zeros((len(kind.cables), *arms), K.dtype)
     )
     floor = jnp.broadcast_to(rounding_of(problem), arms)
-    return damped_newton(evaluate, work, start, floor, 1 if problem.loads is None else LOAD_SHARES)
+    return damped_newton(
+        evaluate, work, start, floor, 1 if problem.loads is None else LOAD_INCREMENTS
+    )

@@ -30,7 +30,7 @@ from .se3 import (
 )
 
 ORDERS = (2, 4, 6)
-"""Orders of the steps; order 2 s uses s Gauss points a step."""
+"""Orders of the steps; order 2 s uses s Gauss points per step."""
 
 
 def step_components(stages: tuple[Vector, ...], h: Array) -> Vector:
@@ -78,7 +78,7 @@ def step_twist(strains: Float[Array, "stages 6"], h: Scalar) -> Twist:
     **Raises:** `ValueError` for another number of Gauss points.
 
     **Source:** Blanes, Casas, Oteo and Ros, The Magnus expansion, Physics Reports 470 (2009), eq.
-    (254) ff., with the brackets turned over for $g' = g \hat\xi$.
+    (254) ff., with the brackets reversed for $g' = g \hat\xi$.
     """
     choice("strains.shape[0]", strains.shape[0], (1, 2, 3))
     return jnp.stack(step_components(tuple(c.split(xi) for xi in strains), h))
@@ -152,7 +152,7 @@ def step_poses(
 def step_jacobian(
     strains: Float[Array, "stages 6"], rates: Float[Array, "stages 6 dofs"], h: Scalar
 ) -> Float[Array, "6 dofs"]:
-    r"""Body twist $(g^{-1} \delta g)^\vee$ of one step's motion per change of the coordinates.
+    r"""Body twist $(g^{-1} \delta g)^\vee$ of one step per change of the coordinates.
 
     **Arguments:** `strains` at the step's Gauss points, `rates` $= \partial \xi / \partial q$
     there, `h` [m].
