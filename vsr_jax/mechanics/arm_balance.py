@@ -1,14 +1,14 @@
-r"""The balance of all cross-sections of an arm together, where loads, given thread lengths or
-friction tie them to each other.
+r"""The balance of all cross-sections of an arm, coupled by loads, prescribed thread lengths or
+friction.
 
-Unknown are the strain at the nodes, the tension T of each tendon driven by its length, and the rate
-$\varphi'$ at which each tendon with friction turns. The residual is that of eq. 21 at each node,
-with the reaction and the tensions that belong to the unknowns; for each tendon driven by its length
+The unknowns are the strain at the nodes, the tension T of each tendon with prescribed length, and
+the turning rate $\varphi'$ of the path of each tendon with friction. The residual is eq. 21 at each
+node, with the reaction and the tensions of the unknowns; for each tendon with prescribed length
 
 $$\min(T, k_0 s) = 0, \quad s = (l^* + \delta)(1 + T / k) - l,$$
 
-the complementarity of tension and slack, with a stiffness $k_0$ [N/m] that only makes the two
-comparable; and for each tendon with friction the rate less that of its path.
+the complementarity of tension and slack, where the stiffness $k_0$ [N/m] only scales the two; and
+for each tendon with friction the difference between the unknown rate and that of its path.
 """
 
 from collections.abc import Iterable
@@ -39,8 +39,8 @@ from .reaction import Loading, Reaction, loading, react
 
 
 class ArmProblem(NamedTuple):
-    """What is to be balanced: `forces` of the threads at their start (ignored for cables), and what
-    ties the sections."""
+    """Data of the coupled balance: `forces` of the threads at their start (ignored for cables), and
+    what couples the sections."""
 
     grid: Grid
     sections: CrossSections
@@ -50,7 +50,7 @@ class ArmProblem(NamedTuple):
     friction: Friction | None
 
     def with_share(self, share: Array) -> "ArmProblem":
-        """The problem with a share of its loads."""
+        """The problem with a fraction of its loads."""
         return self if self.loads is None else self._replace(loads=self.loads.scaled(share))
 
     def at_rest(self) -> "ArmProblem":
@@ -62,8 +62,8 @@ class ArmProblem(NamedTuple):
 
 
 class Kind(NamedTuple):
-    """Static facts of a problem: places of the free strains, of the threads that are cables, of
-    those with friction."""
+    """Static structure of a problem: indices of the free strains, of the threads that are cables,
+    and of those with friction."""
 
     free: tuple[int, ...]
     cables: tuple[int, ...]
@@ -89,8 +89,8 @@ class ArmImbalance(NamedTuple):
 
 
 class ArmState(NamedTuple):
-    """What follows from the unknowns: share of each thread's force at the nodes (None for all), its
-    force there, the reaction, the slack of each cable [m]."""
+    """Quantities computed from the unknowns: share of each thread's force at the nodes (None for
+    1), its force there, the reaction, the slack of each cable [m]."""
 
     carried: tuple[Array | None, ...]
     tau: Vector
@@ -99,7 +99,7 @@ class ArmState(NamedTuple):
 
 
 def problem_of(scene: Scene, inputs: Array, grid: Grid) -> tuple[ArmProblem, Kind]:
-    """What is to be balanced on a grid."""
+    """The coupled balance of a scene on a grid."""
     sections, forces = scene.sections(grid.X), scene.forces(inputs)
     cables = [
         cable_of(scene, inputs[place], place, sections, grid) for place in scene.length_driven
@@ -117,7 +117,7 @@ def problem_of(scene: Scene, inputs: Array, grid: Grid) -> tuple[ArmProblem, Kin
 
 
 def with_tensions(forces: Vector, tensions: Iterable[Array], kind: Kind) -> Vector:
-    """Force of every thread at its start: as given, or minus the tension that was found."""
+    """Force of every thread at its start: as given, or minus the tension of a cable."""
     found = list(forces)
     for place, tension in zip(kind.cables, tensions, strict=True):
         found[place] = -tension
@@ -125,7 +125,7 @@ def with_tensions(forces: Vector, tensions: Iterable[Array], kind: Kind) -> Vect
 
 
 def state_of(unknown: ArmUnknown, problem: ArmProblem, kind: Kind) -> ArmState:
-    """What follows from the unknowns."""
+    """Quantities computed from the unknowns."""
     grid, sections, xi = problem.grid, problem.sections, unknown.xi
     carried = list(sections.reach)
     if problem.friction is not None:
@@ -207,22 +207,22 @@ def _turning_rates(
 
 
 def shape_size(strain: Vector, length: Array) -> Array:
-    r"""Size of a change of strain by the shape it makes, $\sqrt{L^2 |\kappa|^2 + |\upsilon|^2}$:
-    turn over the arm's length, and strain.
+    r"""Size of a change of strain by its effect on the shape, $\sqrt{L^2 |\kappa|^2 +
+    |\upsilon|^2}$: rotation over the length of the arm, and strain.
 
-    In energies the bending of a slender arm would count for nothing: at L/r = 1000 a strain of 1e-6
-    in its fibres turns its tip by a thousandth.
+    An energy norm would underrate the bending of a slender arm: at L/r = 1000 a strain of 1e-6 in
+    its fibres rotates the tip by 1e-3.
     """
     return jnp.sqrt(length**2 * c.dot(strain[:3], strain[:3]) + c.dot(strain[3:], strain[3:]))
 
 
 def shape_of(wrench: Vector, stiffness: Vector, length: Array) -> Array:
-    """`shape_size` of the strain that a wrench makes at rest."""
+    """`shape_size` of the strain that a wrench causes at rest."""
     return shape_size(tuple(f / s for f, s in zip(wrench, stiffness, strict=True)), length)
 
 
 def pull_of(sections: CrossSections, place: int, length: Array) -> Array:
-    """`shape_size` of the strain that a unit of a thread's force makes at rest [1/N]."""
+    """`shape_size` of the strain per unit of a thread's force at rest [1/N]."""
     path = sections.paths[place]
     return shape_of(
         thread_wrench(thread_direction(sections.rest, path)[0], path), sections.stiffness, length
@@ -230,10 +230,9 @@ def pull_of(sections: CrossSections, place: int, length: Array) -> Array:
 
 
 def rounding_of(problem: ArmProblem) -> Array:
-    """What is left of the `shape_size` of a balanced residual in floating point, of the shape of
-    the arms side by side.
+    """Rounding error of the `shape_size` of a balanced residual, one entry per arm of a batch.
 
-    A multiple of the machine's epsilon by the sizes of what is in balance: threads, loads and
+    A multiple of the machine epsilon times the sizes of the terms in balance: threads, loads and
     curvature at rest.
     """
     sections, loads, length = problem.sections, problem.loads, jnp.sum(problem.grid.h, axis=0)

@@ -1,5 +1,5 @@
-r"""Solution of the coupled balance (see `coupled`): damped Newton steps with a tangent that is
-nearly exact, and implicit derivatives."""
+r"""Solution of the coupled balance (see `arm_balance`): damped Newton steps with a nearly exact
+tangent, and implicit derivatives."""
 
 from functools import partial
 from typing import NamedTuple
@@ -42,11 +42,11 @@ from .balance import (
 
 
 def solve_arm(problem: ArmProblem, kind: Kind) -> Root:
-    """Equilibrium of the arm, from the balance without loads and with slack cables. Its point is an
-    `ArmUnknown`.
+    """Equilibrium of the arm; its point is an `ArmUnknown`. Newton's method starts from the balance
+    without loads and with slack cables.
 
-    Derivatives are implicit, of any order, in forward and reverse mode: the exact tangent is solved
-    by refining `approximate_solve`.
+    Derivatives are implicit, of any order, in forward and reverse mode: the exact tangent system is
+    solved by iterative refinement of `approximate_solve`.
     """
 
     def find(problem: ArmProblem) -> Root:
@@ -74,7 +74,7 @@ def solve_arm(problem: ArmProblem, kind: Kind) -> Root:
 
 
 def _start(problem: ArmProblem, kind: Kind) -> ArmUnknown:
-    """Balance of each section alone, without loads, cables slack and without friction, in single
+    """Balance of each section alone, without loads and friction and with slack cables, in single
     precision."""
     tension = (jnp.zeros_like(problem.grid.h[0]),) * len(kind.cables)
     tau = problem.sections.carry(with_tensions(problem.forces, tension, kind))
@@ -84,12 +84,12 @@ def _start(problem: ArmProblem, kind: Kind) -> ArmUnknown:
     xi = tuple(
         jnp.where(sound, x.astype(x0.dtype), x0) for x, x0 in zip(alone.xi, rest, strict=True)
     )
-    xi = with_locked(xi, rest, kind.free)  # these are never corrected
+    xi = with_locked(xi, rest, kind.free)  # the iteration does not change these
     return ArmUnknown(xi, tension, (jnp.zeros_like(xi[0]),) * len(kind.frictional))
 
 
 class _Sizes(NamedTuple):
-    """Sizes of steps and imbalances without unit, one for each of the arms side by side (see
+    """Dimensionless sizes of steps and residuals, one entry per arm of a batch (see
     `shape_size`)."""
 
     grid: Grid
@@ -102,8 +102,7 @@ class _Sizes(NamedTuple):
         return jnp.sum(self.grid.h, axis=0)
 
     def of_step(self, step: ArmUnknown, at: ArmState) -> Array:
-        """Largest change of the shape, of what a tension does to it, or of what friction takes of
-        one."""
+        """Largest change of the shape, plus that by tensions and by friction."""
         step = cast(step, self.grid.h.dtype)
         tensions = [
             tension * pull_of(self.sections, place, self.length)
@@ -113,7 +112,7 @@ class _Sizes(NamedTuple):
         return sum((self._largest(x) for x in (*tensions, *self._rubbed(step.turning, at))), moved)
 
     def of_imbalance(self, imbalance: ArmImbalance, at: ArmState) -> Array:
-        """Root of the mean square of all rows; a cable's is its slack by the arm's length."""
+        """Root mean square of all rows; that of a cable is its slack per length of the arm."""
         wrench = spread(imbalance.wrench, self.kind.free)
         bent = shape_of(wrench, self.sections.stiffness, self.length)
         square = jnp.sum(self.grid.weight * bent**2, axis=(0, 1)) / self.length
@@ -125,12 +124,13 @@ class _Sizes(NamedTuple):
         return jnp.sqrt(sum((jnp.mean(x**2, axis=self._inner(x)) for x in others), square))
 
     def turn(self, step: ArmUnknown) -> Array:
-        """How far the step bends and twists the arm in all [rad]."""
+        """Total angle by which the step bends and twists the arm [rad]."""
         x, y, z = (jnp.abs(k) for k in cast(step.xi[:3], self.grid.h.dtype))
         return jnp.sum(self.grid.weight * (x + y + z), axis=(0, 1))
 
     def work(self, wrench: Vector, step: ArmUnknown) -> Array:
-        """Work of the imbalance over a step; only its sign and its rough size matter."""
+        """Work of the residual over a step, in single precision: only its sign and rough size
+        matter."""
         work = jnp.sum(
             c.single(self.grid.weight) * c.dot(wrench, free_components(step.xi, self.kind.free)),
             axis=(0, 1),
@@ -138,7 +138,7 @@ class _Sizes(NamedTuple):
         return work.astype(self.grid.h.dtype)
 
     def _rubbed(self, rates: Vector, at: ArmState) -> list[Array]:
-        """Changes of turning rates by what they make of the tensions."""
+        """Changes of turning rates, scaled by their effect on the tensions."""
         pulls = [pull_of(self.sections, place, self.length) for place in self.kind.frictional]
         return [
             self.length * at.tau[p] * rate * pull
@@ -165,7 +165,7 @@ def _solve(kind: Kind, start: ArmUnknown, whole: ArmProblem) -> Root:
         imbalance = imbalance_of(unknown, at, problem, kind)
         step, definite = approximate_solve(unknown, at, imbalance, problem, kind, damping)
         size = sizes.of_step(step, at)
-        # A step that coils the arm may well lower the residual, and lead nowhere.
+        # A step that coils the arm may lower the residual without approaching a solution.
         cut = jnp.minimum(1.0, MAX_TURN / jnp.maximum(sizes.turn(step), MAX_TURN))
         step = jax.tree.map(lambda x: cut.astype(x.dtype) * x, step)
         return Damped(

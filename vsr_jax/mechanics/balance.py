@@ -1,7 +1,7 @@
-r"""The balance of a cross-section: the kernel that every model shares.
+r"""The balance of a cross-section: the kernel of all models.
 
-At every X the rod's elastic wrench, the threads' wrench and the reaction $\Lambda$ to the loads
-beyond X are in balance,
+At every X the elastic wrench of the rod, the wrench of the threads and the reaction $\Lambda$ to
+the loads beyond X are in balance,
 
 $$r(\xi) = \Sigma (\xi - \xi^*) - B_\tau(\xi) \tau - \Lambda = 0. \qquad (21)$$
 
@@ -45,12 +45,12 @@ from ..numerics.implicit import implicit_root
 from ..numerics.newton import Evaluation, Root, newton
 
 ALL = tuple(range(6))
-"""Places of all strains."""
+"""Indices of all strains."""
 
 
 class Balance(NamedTuple):
-    """Solution of the balance: strain, whether it was reached, whether $H$ is positive definite
-    there, Newton steps."""
+    """Solution of the balance: strain, whether it is balanced, whether $H$ is positive definite,
+    and the Newton steps."""
 
     xi: Vector
     balanced: Array
@@ -82,7 +82,7 @@ def actuation_wrench(xi: Vector, sections: CrossSections, tau: Vector) -> Vector
 def residual(
     xi: Vector, sections: CrossSections, tau: Vector, reaction: Vector | None = None
 ) -> Vector:
-    """Imbalance of a cross-section (eq. 21): $r = \\Sigma (\\xi - \\xi^*) - B_\\tau \\tau -
+    """Residual of a cross-section (eq. 21): $r = \\Sigma (\\xi - \\xi^*) - B_\\tau \\tau -
     \\Lambda$."""
     elastic = multiply(sections.stiffness, subtract(xi, sections.rest))
     r = subtract(elastic, actuation_wrench(xi, sections, tau))
@@ -96,9 +96,10 @@ def tangent(xi: Vector, sections: CrossSections, tau: Vector) -> Matrix:
     for path, force in zip(sections.paths, tau, strict=True):
         y, z = path.y, path.z
         t, length = thread_direction(xi, path)
-        weight = force / length
+        geometric = force / length
         w = [
-            [weight * ((1.0 if i == j else 0.0) - t[i] * t[j]) for j in range(3)] for i in range(3)
+            [geometric * ((1.0 if i == j else 0.0) - t[i] * t[j]) for j in range(3)]
+            for i in range(3)
         ]
         dw = [
             [y * w[2][j] - z * w[1][j] for j in range(3)],
@@ -133,16 +134,15 @@ def strain_norm(wrench: Vector, stiffness: Vector) -> Array:
 
 
 def rounding_floor(stiffness: Vector, tau: Vector) -> Array:
-    """What is left of `strain_norm` of a balanced residual in floating point: a multiple of the
-    machine's epsilon."""
+    """Rounding error of `strain_norm` of a balanced residual, a multiple of the machine epsilon."""
     scale = force_scale(stiffness)
     load = sum((jnp.abs(force) for force in tau), jnp.zeros_like(scale))
     return 64 * jnp.finfo(scale.dtype).eps * (1 + load / scale)
 
 
 def forces_where(sound: Array, tau: Vector) -> Vector:
-    """Thread forces where the solution is sound and none elsewhere, so that what follows stays
-    finite there."""
+    """Thread forces where the solution is sound, and zero elsewhere, so that later results stay
+    finite."""
     return tuple(jnp.where(sound, force, 0.0) for force in tau)
 
 
@@ -157,12 +157,12 @@ def free_components(vector: Vector, free: tuple[int, ...]) -> Vector:
 
 
 def free_block(lower: Matrix, free: tuple[int, ...]) -> Matrix:
-    """Lower triangle of a symmetric matrix that belongs to the free strains."""
+    """Lower triangle of the block of the free strains in a symmetric matrix."""
     return tuple(tuple(lower[i][j] for j in free if j <= i) for i in free)
 
 
 def spread(vector: Vector, free: tuple[int, ...]) -> Vector:
-    """Six components from those of the free strains, zero elsewhere."""
+    """Six components from those of the free strains, zero for the locked ones."""
     return tuple(
         vector[free.index(i)] if i in free else jnp.zeros_like(vector[0]) for i in range(6)
     )
@@ -190,11 +190,11 @@ def with_locked(xi: Vector, locked: Vector, free: tuple[int, ...]) -> Vector:
 def newton_step(
     xi: Vector, sections: CrossSections, tau: Vector, reaction: Vector | None, free: tuple[int, ...]
 ) -> tuple[Vector, Vector]:
-    """Residual $r$ of the free strains and the step $H^{-1} r$ to subtract, whose last is NaN where
-    $H$ is not positive definite.
+    """Residual $r$ of the free strains and the step $H^{-1} r$ to subtract, whose last component is
+    NaN where $H$ is not positive definite.
 
-    The tangent is factored in single precision, at half the cost: of a small step only its first
-    digits matter.
+    The tangent is factored in single precision at half the cost: only the first digits of a small
+    step matter.
     """
     r = free_components(residual(xi, sections, tau, reaction), free)
     factor = cholesky(free_block(tangent(*single((xi, sections, tau))), free))
@@ -214,12 +214,13 @@ def solve_balance(
     Where $H$ is not positive definite the step is $\Sigma^{-1} r$. Derivatives of any order are
     implicit, $d\xi = -H^{-1} dr$, in forward and reverse mode.
 
-    **Arguments:** component arrays of one shape; `reaction` is left out where there are no external
-    loads; `free`: places of the strains that are solved for, the others keep their rest value;
-    `start`: where to start instead: a section that is pushed under loads may have several balances,
-    and near collapse Newton's method may miss the one there is.
+    **Arguments:** component arrays of one shape.
+    - `reaction`: $\Lambda$, None without external loads.
+    - `free`: indices of the strains that are solved for; the others keep their rest value.
+    - `start`: strain to start from. A section under compression and loads may have several
+      solutions, and near collapse Newton's method from rest may miss the only one.
 
-    **Returns:** a `Balance`. `xi` is the last iterate whether or not it is balanced.
+    **Returns:** a `Balance`. `xi` is the last iterate, balanced or not.
     """
 
     def imbalance(
