@@ -90,7 +90,7 @@ def _tensions(
 
     `shortening`: of each cable's path per tension of each. Each negative pivot is an unstable
     motion of the arm alone that taut cables prevent: the arm is stable if the tangent has no more
-    negative eigenvalues than that. """
+    negative eigenvalues than that."""
     rows, sides = [], []
     for i, (place, cable, tension, slack) in enumerate(
         zip(kind.cables, problem.cables, unknown.tension, at.slack, strict=True)
