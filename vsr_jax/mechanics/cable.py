@@ -2,7 +2,7 @@ r"""Tendons with prescribed length: slack and tension of the cable, and the leng
 path.
 
 A cable of free length $l^* + \delta$ under the tension T has the length $(l^* + \delta)(1 + T /
-k)$; its slack is that length minus the length of the path. """
+k)$; its slack is that length minus the length of the path."""
 
 from typing import NamedTuple
 

@@ -76,9 +76,7 @@ def step_error(
             jnp.any(short, axis=0)[: h.size], span * h * jnp.sqrt(c.dot(change, change)), 0.0
         )
         error = jnp.maximum(error, jnp.max(angle, initial=0.0))
-    series = jnp.sum(
-        lever * (h**2 * c.dot(here, here)) ** (2 * stages - 1) * c.dot(change, change)
-    )
+    series = jnp.sum(lever * (h**2 * c.dot(here, here)) ** (2 * stages - 1) * c.dot(change, change))
     return error + _NEGLECTED[stages] * jnp.sqrt(total * series)
 
 

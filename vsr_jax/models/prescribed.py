@@ -35,8 +35,8 @@ from .prescribed_loaded import solve_prescribed
 
 
 class Projection(NamedTuple):
-    """A basis and the cross-sections at the quadrature points: `weight` [m] of each, `matrix` $B_q$
-    (points, 6, n)."""
+    """A basis and the cross-sections at the quadrature points, with the quadrature `weight` [m] and
+    the `matrix` $B_q$, shape (points, 6, n)."""
 
     sections: CrossSections
     weight: Float[Array, " points"]
@@ -51,8 +51,7 @@ class Projection(NamedTuple):
         return jnp.einsum("x,xia,xi->a", self.weight, self.matrix, c.join(wrench))
 
     def stiffness(self, lower: c.Matrix) -> Float[Array, "dofs dofs"]:
-        """Generalised stiffness $\\int B_q^T H B_q \\, dX$ of a symmetric $H$ given by its lower
-        triangle."""
+        """Generalised stiffness $\\int B_q^T H B_q \\, dX$ from the lower triangle of $H$."""
         weighted = self.weight[:, None, None] * (c.join_matrix(c.symmetric(lower)) @ self.matrix)
         return jnp.einsum("xia,xib->ab", self.matrix, weighted)
 
@@ -120,10 +119,10 @@ class Prescribed(SteppedModel):
     **Arguments:**
     - `basis`: an `AbstractBasis`, such as `Basis.uniform(Legendre(4))`.
     - `points`: Gauss points of the quadrature of $K$ and $B(q)$ on each smooth piece of the arm.
-      With loads, given thread lengths or friction the quadrature is that of the pose steps instead.
+      With loads, prescribed thread lengths or friction the quadrature is that of the pose steps.
     - `steps`, `order`: pose steps as for `StrainDependent`.
 
-    **Raises:** `ValueError` on solving a scene that locks a strain the basis frees.
+    **Raises:** `ValueError` on solving a scene that locks a strain which the basis frees.
     """
 
     basis: AbstractBasis
@@ -268,8 +267,8 @@ def jacobian(
     r"""Geometric Jacobian (eq. 15): $J(q, X) = \mathrm{Ad}_g^{-1} \int_0^X \mathrm{Ad}_g B_q \,
     ds$.
 
-    The body twist of the section at X is $\eta = J \dot q$. It is the exact derivative of the pose
-    steps, hence of their order.
+    The body twist of the section at X is $\eta = J \dot q$. J is the exact derivative of the pose
+    steps and has their order.
 
     **Arguments:**
     - `q`: coordinates, shape (n,).

@@ -1,11 +1,11 @@
-r"""The loaded model in a prescribed basis: $K q = B(q) \tau + \int B_q^T \Lambda \, dX$, with given
-thread lengths and friction.
+r"""The Galerkin balance in a prescribed basis: $K q = B(q) \tau + \int B_q^T \Lambda \, dX$, with
+prescribed thread lengths and friction.
 
-The load term is the virtual work of the loads, integrated by parts: one pass of rotations up the
-arm and one of wrenches down it (see `reaction`), no assembled Jacobian. Unknown are the coordinates
-and the tension of each tendon driven by its length. Newton's tangent is that of the integrals,
-$\int B_q^T (H B_q - \delta\Lambda) dX$, for all coordinates at once and in single precision;
-derivatives of the solution take the exact one of the steps, by forward differentiation.
+The load term is the virtual work of the loads, integrated by parts: one pass of rotations to the
+tip and one of wrenches to the base (see `reaction`), without assembling a Jacobian. The unknowns
+are the coordinates and the tension of each tendon with prescribed length. Newton's method uses the
+tangent $\int B_q^T (H B_q - \delta\Lambda) dX$ in single precision; derivatives of the solution use
+the exact tangent of the discrete residual, by forward differentiation.
 """
 
 from functools import partial
@@ -43,7 +43,7 @@ class GalerkinUnknown(NamedTuple):
 
 
 class NodalBasis(NamedTuple):
-    r"""The basis at the nodes, $B_q$, shape (stages, steps, 6, n), and its change along the arm
+    r"""The basis at the nodes, $B_q$, shape (stages, steps, 6, n), and its derivative along the arm
     (None without friction)."""
 
     matrix: Array
@@ -51,8 +51,8 @@ class NodalBasis(NamedTuple):
 
 
 class GalerkinState(NamedTuple):
-    """What follows from the unknowns: strain at the nodes, share of each thread's force there, its
-    force, the reaction, and the slack of each cable [m]."""
+    """Quantities computed from the unknowns: strain at the nodes, share of each thread's force
+    there, its force, the reaction, and the slack of each cable [m]."""
 
     xi: Vector
     shares: tuple[Array | None, ...]
@@ -78,7 +78,7 @@ def _projected(matrix: Array, wrench: Vector, grid: Grid) -> Array:
 
 
 def _gathered(matrix: Array, wrenches: Vector, grid: Grid) -> Array:
-    r"""Generalised forces of wrenches that stand in an axis behind the nodes, in columns."""
+    r"""Generalised forces, in columns, of wrenches stacked in an axis behind those of the nodes."""
     weighted = jnp.stack(
         [jnp.expand_dims(grid.weight, 2) * f for f in jnp.broadcast_arrays(*wrenches)]
     )
@@ -104,7 +104,7 @@ def shares(
 def state_of(
     unknown: GalerkinUnknown, basis: NodalBasis, problem: ArmProblem, kind: Kind
 ) -> GalerkinState:
-    """What follows from the unknowns."""
+    """Quantities computed from the unknowns."""
     grid, xi = problem.grid, strain(unknown.q, basis, problem)
     share = shares(xi, unknown.q, basis, problem, kind)
     tau = shared(with_tensions(problem.forces, unknown.tension, kind), share)
@@ -119,7 +119,7 @@ def state_of(
 def imbalance(
     unknown: GalerkinUnknown, at: GalerkinState, basis: NodalBasis, problem: ArmProblem
 ) -> GalerkinUnknown:
-    """Residual: generalised force, and for each cable the lesser of tension and scaled slack
+    """Residual: generalised force, and for each cable the smaller of tension and scaled slack
     [N]."""
     r = residual(at.xi, problem.sections, at.tau, None if at.along is None else at.along.wrench)
     rows = [
@@ -134,13 +134,13 @@ def imbalance(
 def approximate_tangent(
     unknown: GalerkinUnknown, at: GalerkinState, basis: NodalBasis, problem: ArmProblem, kind: Kind
 ) -> Array:
-    """Derivative of the residual, friction's own part left out, to the order of the nodes'
-    quadrature and in single precision."""
+    """Derivative of the residual without the tangent of friction, to the order of the quadrature
+    and in single precision."""
     unknown, at, basis, problem = c.single((unknown, at, basis, problem))
     sections, grid, matrix = problem.sections, problem.grid, basis.matrix
     columns = tuple(
         matrix[:, :, i] for i in range(6)
-    )  # the coordinates in an axis behind the nodes
+    )  # with the coordinates in an axis behind those of the nodes
     behind = grid.h.ndim - 1
 
     def beside(tree: c.Tree) -> c.Tree:
@@ -185,9 +185,13 @@ def approximate_tangent(
 
 
 class _Sizes(NamedTuple):
-    """Sizes of changes: `gram` G with $q^T G q$ the mean square of a change's `shape_size`, the
-    factors of K, the shape that each cable's tension makes [1/N], and a stiffness [N] by which the
-    slack of cables is compared."""
+    """Dimensionless sizes of changes and residuals.
+
+    - `gram`: G, where $q^T G q$ is the mean square of `shape_size` along the arm.
+    - `factors`: of K.
+    - `pulls`: `pull_of` each cable [1/N].
+    - `axial`: stiffness [N] that scales the residual of cables.
+    """
 
     gram: Float[Array, "dofs dofs *arms"]
     factors: Float[Array, "dofs dofs *arms"]
@@ -195,7 +199,7 @@ class _Sizes(NamedTuple):
     axial: Array
 
     def turn(self, q: Array) -> Array:
-        """Root of the mean square of a change of shape along the arm."""
+        """Root mean square of the change of shape along the arm."""
         return jnp.sqrt(jnp.maximum(jnp.sum(q * jnp.sum(self.gram * q, axis=1), axis=0), 0.0))
 
     def of_step(self, step: GalerkinUnknown) -> Array:
@@ -203,7 +207,7 @@ class _Sizes(NamedTuple):
         return self.turn(step.q) + jnp.sum(self.pulls * jnp.abs(step.tension), axis=0)
 
     def of_imbalance(self, r: GalerkinUnknown) -> Array:
-        """Size of the change that an imbalance makes of an arm at rest."""
+        """Size of the change of an arm at rest under a residual."""
         square = self.turn(lu.substitute(self.factors, r.q)) ** 2
         return jnp.sqrt(square + jnp.sum((r.tension / self.axial) ** 2, axis=0))
 
@@ -284,7 +288,7 @@ def _solve(kind: Kind, basis: NodalBasis, problem: ArmProblem) -> Root:
         cut = MAX_TURN / jnp.maximum(turn, MAX_TURN)
         falling = (
             lu.diagonal(factors) <= 0
-        )  # taut cables hold as many motions as their own rows have such pivots
+        )  # taut cables prevent as many unstable motions as their own rows have negative pivots
         definite = jnp.sum(falling[:size], axis=0) == jnp.sum(falling[size:], axis=0)
         return Damped(
             jax.tree.map(lambda x: cut * x, step), moved, r.q, sizes.of_imbalance(r), definite

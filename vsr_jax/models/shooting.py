@@ -7,10 +7,10 @@ becomes
 $$\xi' = (\Sigma - A)^{-1} (\Lambda' - \partial r / \partial X + B_\tau \tau'), \quad
 g' = g \hat\xi,$$
 
-with $\Lambda = r(\xi)$. The rotation is known at the base and the reaction at the tip. One shot
-over a long soft arm is ill-conditioned, so the arm is cut into segments, at its breakpoints among
-others; the rotation and the reaction at the start of each are unknown and continuous but for the
-point loads. The first guess is a solution on steps.
+with $\Lambda = r(\xi)$. The rotation is known at the base and the reaction at the tip. Single
+shooting over a long soft arm is ill-conditioned, so the arm is divided into segments, also at its
+breakpoints. The unknowns are the rotation and the reaction at the start of each segment, continuous
+except for point loads. The initial guess is a solution on steps.
 """
 
 from typing import Any, NamedTuple
@@ -31,7 +31,11 @@ from ..numerics.quadrature import Grid
 from ..numerics.se3 import base_pose, hat, rotation_components, unskew
 
 _SHOTS = 12
-_INSIDE = 1e-10  # of a segment: what is evaluated at its ends belongs to it
+"""Bound on the Newton steps of the shooting; from a solution on steps they converge
+quadratically."""
+_INSIDE = 1e-10
+"""Distance from the ends of a segment, as a fraction of it, at which it is evaluated there: at a
+jump the values are those inside the segment."""
 
 
 class Guess(NamedTuple):
@@ -52,15 +56,14 @@ class ShootingUnknown(NamedTuple):
 
 
 class Line(NamedTuple):
-    """What is integrated over a segment: the strain, the pose relative to its start, and the
-    rotation in the world frame."""
+    """State integrated over a segment: the strain, and the pose relative to the start."""
 
     xi: Array
     g: Array
 
 
 class Control(NamedTuple):
-    """How diffrax integrates: solver, tolerances and the bound on its steps."""
+    """Settings of diffrax: solver, tolerances and the bound on its steps."""
 
     solver: Any
     rtol: float
@@ -70,8 +73,8 @@ class Control(NamedTuple):
 
 class Shot(NamedTuple):
     """Solution: the segments (a grid with one step each), the unknowns, the pose at the start of
-    each and at the end of the arm, whether the segments fit and the largest number of integration
-    steps."""
+    each and at the end of the arm, whether the segments match, and the largest number of
+    integration steps."""
 
     segments: Grid
     unknown: ShootingUnknown
@@ -90,8 +93,8 @@ def integrate(
     reaction: Array,
     part: Array,
 ) -> tuple[Line, Array, Array]:
-    """Strain, and pose relative to the segment's start, at a part of it; whether diffrax got there,
-    and its steps."""
+    """Strain and pose relative to the start of a segment at a fraction `part` of it, whether
+    diffrax succeeded, and its steps."""
     free = scene.free
 
     def at(t: Array) -> tuple[Array, CrossSections, Vector]:
@@ -155,10 +158,10 @@ def shoot(
     control: Control,
     tolerance: float,
 ) -> Shot:
-    """Rotations and reactions at the start of the segments with which they fit together."""
+    """Rotations and reactions at the start of the segments for which neighbours match."""
 
     def over(start: Array, h: Array, rotation: Array, reaction: Array) -> tuple[Array, tuple]:
-        """Strain's reaction and rotation at the end, as one array."""
+        """Reaction and rotation at the end, as one array."""
         line, done, steps = integrate(
             scene, guess, control, start, h, rotation, reaction, jnp.ones_like(h)
         )
@@ -226,8 +229,8 @@ def shoot(
 
 
 def _scale(scene: Scene, first: ShootingUnknown, count: int) -> Array:
-    """Sizes of the unknowns of each segment: a radian, and the reaction or what bends the arm by a
-    radian if that is more."""
+    """Scales of the unknowns of each segment: 1 rad, and the reaction or, if larger, the wrench
+    that bends the arm by 1 rad."""
     length = scene.rod.length
     moment = jnp.max(jnp.stack(scene.rod.stiffness(0.5 * length)[:3])) / length
     size = jnp.maximum(
@@ -238,8 +241,8 @@ def _scale(scene: Scene, first: ShootingUnknown, count: int) -> Array:
 
 
 def _misfit(scene: Scene, unknown: ShootingUnknown, ends: Array, segments: Grid) -> Array:
-    """What is wrong at the start of each segment: rotation (3) against the one before, reaction (6)
-    at its end against the next."""
+    """Mismatch of the segments: rotation (3) at the start against the end of the segment before,
+    reaction (6) at the end against the start of the next."""
     base = base_pose(scene.rod.base, ends.dtype)[:3, :3]
     wrench, rotation = ends[:, :6], ends[:, 6:].reshape(-1, 3, 3)
     before = jnp.concatenate([base[None], rotation[:-1]])

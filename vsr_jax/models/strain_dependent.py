@@ -1,8 +1,8 @@
-r"""The model of eq. 19-21: the basis $B_q = \Sigma^{-1} B_\tau(\xi)$ makes $q = \tau$, and the
-strain is solved at the nodes.
+r"""The strain-dependent model (eq. 19-21): with the basis $B_q = \Sigma^{-1} B_\tau(\xi)$ the
+coordinates are $q = \tau$, and the strain is solved at the nodes.
 
-Without loads every node is solved alone. With them the reaction to the loads is part of each node's
-balance, and the nodes are solved together (see `coupled`).
+Without loads each node is solved alone. With loads the reaction is part of the balance of each node
+and all nodes are solved together (see `arm_balance`).
 """
 
 import equinox as eqx
@@ -26,13 +26,14 @@ class StrainDependent(SteppedModel):
     \Lambda) + \xi^*$ (eq. 21).
 
     Without loads $\Lambda = 0$ and the strain is exact; the only error is that of the pose steps.
-    With loads the reaction is that of the steps' shape, and the pose at the ends of the steps keeps
-    their order.
+    With loads the reaction is computed on the same steps, and the pose at their ends has their
+    order.
 
     **Arguments:**
-    - `steps`: steps along the arm, at least one on each of its smooth pieces, the others by their
-      lengths.
-    - `order`: order of the steps, 2, 4 (Zanna's, eq. 5) or 6, with one, two or three nodes each.
+    - `steps`: steps along the arm, at least one on each smooth piece, the others distributed by
+      length.
+    - `order`: order of the steps, 2, 4 (Zanna's, eq. 5) or 6, with one, two or three nodes per
+      step.
     """
 
     steps: int = eqx.field(static=True)
@@ -97,8 +98,8 @@ class StrainDependent(SteppedModel):
 
 
 def _status_of_ends(scene: Scene, forces: Vector, xi: Vector) -> Array:
-    """Status of the arm's two ends, which no node sees: a tapering arm fails at its tip first. One
-    Newton step from the strain at the node beside is exact enough to tell."""
+    """Status of the two ends of the arm, where no node lies: a tapered arm fails at its tip first.
+    One Newton step from the strain at the nearest node is accurate enough."""
     sections = scene.sections(jnp.stack([jnp.zeros_like(scene.rod.length), scene.rod.length]))
     tau = sections.carry(forces)
     beside = lax.stop_gradient(tuple(jnp.stack([x[0, 0], x[-1, -1]]) for x in xi))
