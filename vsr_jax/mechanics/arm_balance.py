@@ -21,7 +21,7 @@ from jaxtyping import Array
 from ..arm.actuator import Tendon
 from ..arm.scene import CrossSections, Scene, shared
 from ..numerics import component as c
-from ..numerics.component import Vector
+from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import Grid
 from .balance import free_components, residual, thread_direction, thread_wrench, without_force
 from .cable import Cable, cable_of, path_length
@@ -44,7 +44,7 @@ class ArmProblem(NamedTuple):
 
     grid: Grid
     sections: CrossSections
-    forces: Vector
+    forces: Forces
     loads: Loading | None
     cables: tuple[Cable, ...]
     friction: Friction | None
@@ -75,7 +75,7 @@ class ArmUnknown(NamedTuple):
     the nodes of each tendon with friction."""
 
     xi: Vector
-    tension: Vector
+    tension: Forces
     turning: Vector
 
 
@@ -84,7 +84,7 @@ class ArmImbalance(NamedTuple):
     each tendon with friction."""
 
     wrench: Vector
-    cable: Vector
+    cable: Forces
     turning: Vector
 
 
@@ -93,7 +93,7 @@ class ArmState(NamedTuple):
     1), its force there, the reaction, the slack of each cable [m]."""
 
     carried: tuple[Array | None, ...]
-    tau: Vector
+    tau: Forces
     along: Reaction | None
     slack: Vector
 
@@ -116,7 +116,7 @@ def problem_of(scene: Scene, inputs: Array, grid: Grid) -> tuple[ArmProblem, Kin
     return problem, Kind(scene.free, scene.length_driven, scene.frictional)
 
 
-def with_tensions(forces: Vector, tensions: Iterable[Array], kind: Kind) -> Vector:
+def with_tensions(forces: Forces, tensions: Iterable[Array], kind: Kind) -> Forces:
     """Force of every thread at its start: as given, or minus the tension of a cable."""
     found = list(forces)
     for place, tension in zip(kind.cables, tensions, strict=True):

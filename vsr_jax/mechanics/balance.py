@@ -30,6 +30,7 @@ from jaxtyping import Array
 from ..arm.routing import Path, thread_tangent
 from ..arm.scene import CrossSections
 from ..numerics.component import (
+    Forces,
     Matrix,
     Vector,
     add,
@@ -71,7 +72,7 @@ def thread_wrench(t: Vector, path: Path) -> Vector:
     return (path.y * t[2] - path.z * t[1], path.z * t[0], -path.y * t[0], *t)
 
 
-def actuation_wrench(xi: Vector, sections: CrossSections, tau: Vector) -> Vector:
+def actuation_wrench(xi: Vector, sections: CrossSections, tau: Forces) -> Vector:
     """Wrench of all threads (eq. 17): $F_a = B_\\tau(\\xi) \\tau$."""
     total = tuple(jnp.zeros_like(x) for x in xi)
     for path, force in zip(sections.paths, tau, strict=True):
@@ -80,7 +81,7 @@ def actuation_wrench(xi: Vector, sections: CrossSections, tau: Vector) -> Vector
 
 
 def residual(
-    xi: Vector, sections: CrossSections, tau: Vector, reaction: Vector | None = None
+    xi: Vector, sections: CrossSections, tau: Forces, reaction: Vector | None = None
 ) -> Vector:
     """Residual of a cross-section (eq. 21): $r = \\Sigma (\\xi - \\xi^*) - B_\\tau \\tau -
     \\Lambda$."""
@@ -89,7 +90,7 @@ def residual(
     return r if reaction is None else subtract(r, reaction)
 
 
-def tangent(xi: Vector, sections: CrossSections, tau: Vector) -> Matrix:
+def tangent(xi: Vector, sections: CrossSections, tau: Forces) -> Matrix:
     """Lower triangle of the tangent stiffness (eq. 12-13): $H = \\Sigma - A$."""
     zero = jnp.zeros_like(xi[0])
     rows = [[zero] * i + [sections.stiffness[i]] for i in range(6)]
@@ -133,20 +134,20 @@ def strain_norm(wrench: Vector, stiffness: Vector) -> Array:
     return jnp.sqrt(dot(wrench, strain) / force_scale(stiffness))
 
 
-def rounding_floor(stiffness: Vector, tau: Vector) -> Array:
+def rounding_floor(stiffness: Vector, tau: Forces) -> Array:
     """Rounding error of `strain_norm` of a balanced residual, a multiple of the machine epsilon."""
     scale = force_scale(stiffness)
     load = sum((jnp.abs(force) for force in tau), jnp.zeros_like(scale))
     return 64 * jnp.finfo(scale.dtype).eps * (1 + load / scale)
 
 
-def forces_where(sound: Array, tau: Vector) -> Vector:
+def forces_where(sound: Array, tau: Forces) -> Forces:
     """Thread forces where the solution is sound, and zero elsewhere, so that later results stay
     finite."""
     return tuple(jnp.where(sound, force, 0.0) for force in tau)
 
 
-def without_force(tau: Vector) -> Vector:
+def without_force(tau: Forces) -> Forces:
     """Forces of zero in place of `tau`."""
     return tuple(jnp.zeros_like(force) for force in tau)
 
@@ -188,7 +189,7 @@ def with_locked(xi: Vector, locked: Vector, free: tuple[int, ...]) -> Vector:
 
 
 def newton_step(
-    xi: Vector, sections: CrossSections, tau: Vector, reaction: Vector | None, free: tuple[int, ...]
+    xi: Vector, sections: CrossSections, tau: Forces, reaction: Vector | None, free: tuple[int, ...]
 ) -> tuple[Vector, Vector]:
     """Residual $r$ of the free strains and the step $H^{-1} r$ to subtract, whose last component is
     NaN where $H$ is not positive definite.
@@ -204,7 +205,7 @@ def newton_step(
 
 def solve_balance(
     sections: CrossSections,
-    tau: Vector,
+    tau: Forces,
     reaction: Vector | None = None,
     free: tuple[int, ...] = ALL,
     start: Vector | None = None,
@@ -224,21 +225,21 @@ def solve_balance(
     """
 
     def imbalance(
-        x: Vector, sections: CrossSections, tau: Vector, reaction: Vector | None, _: Vector | None
+        x: Vector, sections: CrossSections, tau: Forces, reaction: Vector | None, _: Vector | None
     ) -> Vector:
         return free_components(
             residual(completed(x, sections.rest, free), sections, tau, reaction), free
         )
 
     def linear_solve(
-        x: Vector, sections: CrossSections, tau: Vector, *others: Vector | None
+        x: Vector, sections: CrossSections, tau: Forces, *others: Vector | None
     ) -> Vector:
         *_, right = others
         assert right is not None
         lower = tangent(completed(x, sections.rest, free), sections, tau)
         return cholesky_solve(cholesky(free_block(lower, free)), right)
 
-    def at_rest(x: Vector, sections: CrossSections, tau: Vector, *others: Vector | None) -> tuple:
+    def at_rest(x: Vector, sections: CrossSections, tau: Forces, *others: Vector | None) -> tuple:
         return free_components(sections.rest, free), sections, without_force(tau), *others
 
     root = implicit_root(
@@ -259,7 +260,7 @@ def solve_balance(
 def _find_balance(
     free: tuple[int, ...],
     sections: CrossSections,
-    tau: Vector,
+    tau: Forces,
     reaction: Vector | None,
     start: Vector | None,
 ) -> Root:

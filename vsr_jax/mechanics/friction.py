@@ -19,7 +19,7 @@ from jaxtyping import Array
 from ..arm.routing import thread_tangent
 from ..arm.scene import CrossSections
 from ..numerics import component as c
-from ..numerics.component import Vector
+from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import Grid, beyond, interpolation, locate, weighted, within
 from .balance import actuation_wrench, completed, free_block, free_components, residual, tangent
 
@@ -102,8 +102,8 @@ def kinks_of(
 
 def balanced_strain_rate(
     xi: Vector,
-    tau: Vector,
-    tau_rate: Vector,
+    tau: Forces,
+    tau_rate: Forces,
     reaction_rate: Vector | None,
     sections: CrossSections,
     rate: CrossSections,

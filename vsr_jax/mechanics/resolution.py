@@ -30,7 +30,7 @@ from jaxtyping import Array
 
 from ..arm.scene import CrossSections
 from ..numerics import component as c
-from ..numerics.component import Vector
+from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import Grid, gauss_legendre
 from ..typing import Scalar
 from .balance import residual
@@ -48,7 +48,7 @@ _NEGLECTED = {1: 1 / 12, 2: 1 / 720, 3: 1 / 30240}
 
 
 def step_error(
-    xi: Vector, sections: CrossSections, forces: Vector, grid: Grid, *, loaded: bool
+    xi: Vector, sections: CrossSections, forces: Forces, grid: Grid, *, loaded: bool
 ) -> Scalar:
     """Estimate of the error of the tip by the steps, as a fraction of the arm's length.
 
@@ -81,7 +81,7 @@ def step_error(
 
 
 def _threads(
-    xi: Vector, sections: CrossSections, forces: Vector, grid: Grid
+    xi: Vector, sections: CrossSections, forces: Forces, grid: Grid
 ) -> list[tuple[Scalar, Scalar]]:
     """For each thread the phase of its wave per step, and the total angle by which it bends and
     shears the arm."""

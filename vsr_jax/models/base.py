@@ -15,7 +15,7 @@ from ..arm.routing import Path, thread_tangent
 from ..arm.scene import CrossSections, Scene, shared
 from ..mechanics.balance import thread_direction, thread_wrench
 from ..mechanics.resolution import COARSE, step_error
-from ..numerics.component import Vector, dot
+from ..numerics.component import Forces, Vector, dot
 from ..numerics.magnus import step_components, step_poses, tip_pose
 from ..numerics.quadrature import Grid, gauss_legendre, locate, make_grid
 from ..numerics.se3 import exp_components, pose
@@ -67,7 +67,7 @@ class Nodes(NamedTuple):
     sections: CrossSections
     shares: tuple[Array | None, ...]
 
-    def tau(self, forces: Vector) -> Vector:
+    def tau(self, forces: Forces) -> Forces:
         """Force of each thread at the nodes."""
         return shared(forces, self.shares)
 
@@ -77,7 +77,7 @@ class Outcome(NamedTuple):
     at their start, a `Status` and the Newton steps."""
 
     state: Any
-    forces: Vector
+    forces: Forces
     status: Array
     steps: Array
 
@@ -98,28 +98,28 @@ class Model(eqx.Module):
 
     @abstractmethod
     def strain(
-        self, scene: Scene, forces: Vector, state: Any, X: Float[Array, " stations"]
+        self, scene: Scene, forces: Forces, state: Any, X: Float[Array, " stations"]
     ) -> Vector:
         r"""Strain $\xi$ at abscissas X, six component arrays."""
 
     @abstractmethod
-    def tip(self, scene: Scene, forces: Vector, state: Any) -> Pose:
+    def tip(self, scene: Scene, forces: Forces, state: Any) -> Pose:
         """Pose of the arm's end."""
 
     @abstractmethod
     def poses(
-        self, scene: Scene, forces: Vector, state: Any, X: Float[Array, " stations"]
+        self, scene: Scene, forces: Forces, state: Any, X: Float[Array, " stations"]
     ) -> Float[Array, "stations 4 4"]:
         """Poses at abscissas X."""
 
-    def coordinates(self, scene: Scene, forces: Vector, state: Any) -> Float[Array, " dofs"]:
+    def coordinates(self, scene: Scene, forces: Forces, state: Any) -> Float[Array, " dofs"]:
         """Coordinates of the strain in the model's basis."""
         raise ValueError(
             f"q: got a solution by {type(self).__name__}, need one by StrainDependent or Prescribed"
         )
 
     @abstractmethod
-    def nodes(self, scene: Scene, forces: Vector, state: Any) -> Nodes:
+    def nodes(self, scene: Scene, forces: Forces, state: Any) -> Nodes:
         """Nodes from which integrals along the arm are computed."""
 
     @abstractmethod
@@ -127,7 +127,7 @@ class Model(eqx.Module):
         """The same model with twice the steps, or with tighter tolerances if the steps are
         adaptive."""
 
-    def step_error(self, scene: Scene, forces: Vector, state: Any) -> Scalar | None:
+    def step_error(self, scene: Scene, forces: Forces, state: Any) -> Scalar | None:
         """Rough estimate of the tip's error by the steps, as a fraction of the arm's length; None
         for adaptive steps."""
         return None
@@ -147,13 +147,13 @@ class SteppedModel(Model):
         """Steps along the arm and their nodes."""
         return make_grid(scene.edges(self.breakpoints(scene)), self.steps, self.order // 2)
 
-    def tip(self, scene: Scene, forces: Vector, state: Any) -> Pose:
+    def tip(self, scene: Scene, forces: Forces, state: Any) -> Pose:
         return tip_pose(self.node_strain(scene, state), self.grid(scene).h, scene.rod.base)
 
     def finer(self) -> "SteppedModel":
         return replace(self, steps=2 * self.steps)
 
-    def step_error(self, scene: Scene, forces: Vector, state: Any) -> Scalar:
+    def step_error(self, scene: Scene, forces: Forces, state: Any) -> Scalar:
         nodes = self.nodes(scene, forces, state)
         sections = nodes.sections._replace(
             reach=nodes.shares
@@ -165,7 +165,7 @@ class SteppedModel(Model):
         """Strain at the nodes of `grid`, six component arrays of shape (stages, steps)."""
 
     def poses(
-        self, scene: Scene, forces: Vector, state: Any, X: Float[Array, " stations"]
+        self, scene: Scene, forces: Forces, state: Any, X: Float[Array, " stations"]
     ) -> Float[Array, "stations 4 4"]:
         grid = self.grid(scene)
         ends = step_poses(self.node_strain(scene, state), grid.h, scene.rod.base)
@@ -195,7 +195,7 @@ def resolved(model: Model, scene: Scene, outcome: Outcome) -> Outcome:
 def classify(
     xi: Vector,
     sections: CrossSections,
-    tau: Vector,
+    tau: Forces,
     balanced: Array,
     definite: Array,
     *,

@@ -23,7 +23,7 @@ from ..mechanics.balance import (
 )
 from ..mechanics.reaction import loading, react_at
 from ..numerics import component as c
-from ..numerics.component import Vector
+from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import locate, make_grid
 from ..numerics.se3 import coad, hat, inverse
 from ..typing import Pose, Scalar, Twist
@@ -40,7 +40,7 @@ class Found(NamedTuple):
     inputs: Array
 
 
-def cosserat_strain_rate(scene: Scene, tau: Vector, xi: Twist, X: Scalar) -> Twist:
+def cosserat_strain_rate(scene: Scene, tau: Forces, xi: Twist, X: Scalar) -> Twist:
     r"""Right side of eq. (12): $\xi' = (\Sigma - A)^{-1} (a - b - c)$.
 
     With $r = F_i - F_a$ the balance (8) is $r' + \mathrm{ad}^*_\xi r = 0$, and $r' = H \xi' +
@@ -112,19 +112,19 @@ class Continuum(Model):
         return Outcome(Found(tip, inputs), forces, status, steps)
 
     def strain(
-        self, scene: Scene, forces: Vector, state: Found, X: Float[Array, " stations"]
+        self, scene: Scene, forces: Forces, state: Found, X: Float[Array, " stations"]
     ) -> Vector:
         return c.split(_line(self, scene, state.inputs, X).xi)
 
-    def tip(self, scene: Scene, forces: Vector, state: Found) -> Pose:
+    def tip(self, scene: Scene, forces: Forces, state: Found) -> Pose:
         return _from_base(scene, state.tip)
 
     def poses(
-        self, scene: Scene, forces: Vector, state: Found, X: Float[Array, " stations"]
+        self, scene: Scene, forces: Forces, state: Found, X: Float[Array, " stations"]
     ) -> Float[Array, "stations 4 4"]:
         return _from_base(scene, _line(self, scene, state.inputs, X).g)
 
-    def nodes(self, scene: Scene, forces: Vector, state: Found) -> Nodes:
+    def nodes(self, scene: Scene, forces: Forces, state: Found) -> Nodes:
         grid = self.derivative.grid(scene)
         xi = tuple(
             x.reshape(grid.X.shape) for x in self.strain(scene, forces, state, grid.X.reshape(-1))

@@ -21,7 +21,7 @@ from ..mechanics.balance import (
     without_force,
 )
 from ..numerics import component as c, lu
-from ..numerics.component import Vector
+from ..numerics.component import Forces, Vector
 from ..numerics.implicit import implicit_root
 from ..numerics.magnus import ORDERS, accumulate_jacobian
 from ..numerics.newton import Evaluation, Root, newton
@@ -70,29 +70,29 @@ def project(scene: Scene, basis: AbstractBasis, points: int) -> Projection:
     return Projection(scene.sections(X), grid.weight.reshape(-1), matrix)
 
 
-def solve_projected(projection: Projection, tau: Vector) -> Root:
+def solve_projected(projection: Projection, tau: Forces) -> Root:
     r"""Coordinates q with $K q = B(q) \tau$ (eq. 18), by Newton's method on the symmetric tangent
     $K - \partial (B \tau) / \partial q$. Derivatives of any order are implicit."""
 
-    def linear_solve(q: Array, projection: Projection, tau: Vector, right: Array) -> Array:
+    def linear_solve(q: Array, projection: Projection, tau: Forces, right: Array) -> Array:
         return lu.solve(_tangent(q, projection, tau), right)
 
-    def at_rest(q: Array, projection: Projection, tau: Vector) -> tuple:
+    def at_rest(q: Array, projection: Projection, tau: Forces) -> tuple:
         return jnp.zeros_like(q), projection, without_force(tau)
 
     return implicit_root(_find_projected, _imbalance, linear_solve, at_rest, projection, tau)
 
 
-def _imbalance(q: Array, projection: Projection, tau: Vector) -> Array:
+def _imbalance(q: Array, projection: Projection, tau: Forces) -> Array:
     """$K q - B(q) \\tau$."""
     return projection.integrate(residual(projection.strain(q), projection.sections, tau))
 
 
-def _tangent(q: Array, projection: Projection, tau: Vector) -> Array:
+def _tangent(q: Array, projection: Projection, tau: Forces) -> Array:
     return projection.stiffness(tangent(projection.strain(q), projection.sections, tau))
 
 
-def _find_projected(projection: Projection, tau: Vector) -> Root:
+def _find_projected(projection: Projection, tau: Forces) -> Root:
     K = projection.elastic_stiffness()
     elastic = lu.factor(K)
     axial = jnp.sum(projection.weight * force_scale(projection.sections.stiffness))
@@ -186,14 +186,14 @@ class Prescribed(SteppedModel):
                 f"{', '.join(scene.free_strains)}, as the scene"
             )
 
-    def coordinates(self, scene: Scene, forces: Vector, state: Array) -> Float[Array, " dofs"]:
+    def coordinates(self, scene: Scene, forces: Forces, state: Array) -> Float[Array, " dofs"]:
         return state
 
     def node_strain(self, scene: Scene, state: Array) -> Vector:
         X = self.grid(scene).X
         return tuple(x.reshape(X.shape) for x in self._strain(scene, state, X.reshape(-1)))
 
-    def nodes(self, scene: Scene, forces: Vector, state: Array) -> Nodes:
+    def nodes(self, scene: Scene, forces: Forces, state: Array) -> Nodes:
         grid = self.grid(scene)
         xi, sections = self.node_strain(scene, state), scene.sections(grid.X)
         if not scene.frictional:
@@ -207,7 +207,7 @@ class Prescribed(SteppedModel):
         )
 
     def strain(
-        self, scene: Scene, forces: Vector, state: Array, X: Float[Array, " stations"]
+        self, scene: Scene, forces: Forces, state: Array, X: Float[Array, " stations"]
     ) -> Vector:
         return self._strain(scene, state, X)
 

@@ -29,7 +29,7 @@ from ..mechanics.friction import kinks_of, share_left, turning_rate
 from ..mechanics.reaction import Reaction, react, reaction_change
 from ..numerics import component as c, lu
 from ..numerics.batching import arms_in, side_by_side
-from ..numerics.component import Vector
+from ..numerics.component import Forces, Vector
 from ..numerics.implicit import implicit_root
 from ..numerics.newton import LOAD_INCREMENTS, MAX_TURN, Damped, Root, damped_newton
 from ..numerics.quadrature import Grid
@@ -56,7 +56,7 @@ class GalerkinState(NamedTuple):
 
     xi: Vector
     shares: tuple[Array | None, ...]
-    tau: Vector
+    tau: Forces
     along: Reaction | None
     slack: Vector
 

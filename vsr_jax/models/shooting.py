@@ -26,7 +26,7 @@ from ..mechanics.arm_balance import shares_at
 from ..mechanics.balance import residual, solve_balance
 from ..mechanics.friction import balanced_strain_rate, reaction_rate
 from ..numerics import component as c
-from ..numerics.component import Vector
+from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import Grid
 from ..numerics.se3 import base_pose, hat, rotation_components, unskew
 
@@ -44,7 +44,7 @@ class Guess(NamedTuple):
 
     grid: Grid
     xi: Vector
-    forces: Vector
+    forces: Forces
     turning: Vector
 
 

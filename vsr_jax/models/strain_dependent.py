@@ -15,7 +15,7 @@ from ..mechanics.arm_balance import ArmUnknown, problem_of, shares_at, state_of,
 from ..mechanics.arm_solve import solve_arm
 from ..mechanics.balance import forces_where, newton_step, solve_balance, spread
 from ..mechanics.reaction import loading, react_at
-from ..numerics.component import Vector
+from ..numerics.component import Forces, Vector
 from ..numerics.magnus import ORDERS
 from ..validation import choice, count
 from .base import Nodes, Outcome, Status, SteppedModel, classify, rest_where_failed
@@ -74,7 +74,7 @@ class StrainDependent(SteppedModel):
     def node_strain(self, scene: Scene, state: ArmUnknown) -> Vector:
         return state.xi
 
-    def nodes(self, scene: Scene, forces: Vector, state: ArmUnknown) -> Nodes:
+    def nodes(self, scene: Scene, forces: Forces, state: ArmUnknown) -> Nodes:
         grid = self.grid(scene)
         return Nodes(
             grid,
@@ -83,11 +83,11 @@ class StrainDependent(SteppedModel):
             shares_at(scene, state.xi, state.turning, grid, grid.X),
         )
 
-    def coordinates(self, scene: Scene, forces: Vector, state: ArmUnknown) -> Float[Array, " dofs"]:
+    def coordinates(self, scene: Scene, forces: Forces, state: ArmUnknown) -> Float[Array, " dofs"]:
         return jnp.array(forces, state.xi[0].dtype)
 
     def strain(
-        self, scene: Scene, forces: Vector, state: ArmUnknown, X: Float[Array, " stations"]
+        self, scene: Scene, forces: Forces, state: ArmUnknown, X: Float[Array, " stations"]
     ) -> Vector:
         grid = self.grid(scene)
         loads = loading(scene, grid)
@@ -97,7 +97,7 @@ class StrainDependent(SteppedModel):
         return solve_balance(scene.sections(X), tau, reaction, scene.free, start).xi
 
 
-def _status_of_ends(scene: Scene, forces: Vector, xi: Vector) -> Array:
+def _status_of_ends(scene: Scene, forces: Forces, xi: Vector) -> Array:
     """Status of the two ends of the arm, where no node lies: a tapered arm fails at its tip first.
     One Newton step from the strain at the nearest node is accurate enough."""
     sections = scene.sections(jnp.stack([jnp.zeros_like(scene.rod.length), scene.rod.length]))

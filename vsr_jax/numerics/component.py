@@ -17,6 +17,9 @@ from jaxtyping import Array
 from ..typing import cast
 
 Vector = tuple[Array, ...]
+Vector3 = tuple[Array, Array, Array]
+Wrench = tuple[Array, Array, Array, Array, Array, Array]
+Forces = tuple[Array, ...]
 Matrix = tuple[Vector, ...]
 Tree = TypeVar("Tree")
 
