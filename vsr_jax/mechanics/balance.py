@@ -22,7 +22,7 @@ with $P = [-\tilde d, 1]$, is symmetric. Symbols, each a tuple of component arra
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -232,10 +232,8 @@ def solve_balance(
         )
 
     def linear_solve(
-        x: Vector, sections: CrossSections, tau: Forces, *others: Vector | None
+        x: Vector, sections: CrossSections, tau: Forces, _: Any, __: Any, right: Vector
     ) -> Vector:
-        *_, right = others
-        assert right is not None
         lower = tangent(completed(x, sections.rest, free), sections, tau)
         return cholesky_solve(cholesky(free_block(lower, free)), right)
 

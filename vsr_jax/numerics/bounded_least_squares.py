@@ -25,6 +25,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ..typing import Scalar
+from .component import select
 
 _POWERS = (1 / 8, 3 / 16, 5 / 16)
 """The weights as powers of the machine epsilon; the square of the last is still resolved in the
@@ -112,9 +113,9 @@ def nearest(
         regular = Nearest(
             state.point.s, state.point.s, _free(state.point.s, _slope(state.point, w, rest))
         )
-        found = _where(over & (w > 0), regular, state.found)._replace(share=state.point.s)
+        found = select(over & (w > 0), regular, state.found)._replace(share=state.point.s)
         state = state._replace(found=found, stage=state.stage + over)
-        return _where(
+        return select(
             state.stage == len(weights), _ended(state, starts), _aimed(state, over, weights, rest)
         )
 
@@ -122,10 +123,6 @@ def nearest(
         return (state.start <= len(starts)) & (state.miss > allowed)
 
     return lax.while_loop(pending, advance, _begun(f, starts, allowed)).best
-
-
-def _where(condition: Array, this: Any, that: Any) -> Any:
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), this, that)
 
 
 def _begun(f: Callable[[Array], Array], starts: Array, allowed: Scalar) -> _Search:
@@ -147,7 +144,7 @@ def _judged(state: _Search, trial: _Point, w: Array, rest: Array) -> _Search:
     factor = jnp.where(better, jnp.where(gain > 0.75, 0.1, jnp.where(gain < 0.25, 3.0, 1.0)), 4.0)
     curvature = jnp.where(better, _updated(state.curvature, state.point, trial), state.curvature)
     return state._replace(
-        point=_where(better, trial, state.point),
+        point=select(better, trial, state.point),
         curvature=jnp.where(fresh, 0.0, curvature),
         damping=jnp.where(fresh, _DAMPING, factor * state.damping),
         steps=state.steps + 1,
@@ -179,7 +176,7 @@ def _ended(state: _Search, starts: Array) -> _Search:
         start=start,
         stage=jnp.full_like(state.stage, len(_POWERS) - 1),
         steps=jnp.zeros_like(state.steps),
-        best=_where(nearer, state.found, state.best),
+        best=select(nearer, state.found, state.best),
         miss=jnp.where(nearer, there, state.miss),
     )
 

@@ -61,6 +61,11 @@ def symmetric(lower: Matrix) -> Matrix:
     return tuple(tuple(lower[max(i, j)][min(i, j)] for j in range(size)) for i in range(size))
 
 
+def select(condition: Array, a: Tree, b: Tree) -> Tree:
+    """`a` where the condition holds and `b` elsewhere, component by component."""
+    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
+
+
 def add(a: Tree, b: Tree) -> Tree:
     """Sum $a + b$ of two vectors or two matrices, component by component."""
     return jax.tree.map(operator.add, a, b)

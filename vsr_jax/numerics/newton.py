@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from .component import Tree
+from .component import select
 
 MAX_STEPS = 50
 """Bound on the evaluations of `newton`; the cases of the paper take 1 to 5."""
@@ -99,7 +99,7 @@ def newton(evaluate: Callable[[Any], Evaluation], start: Any, floor: Array) -> I
         new = evaluate(trial)
         better = (new.merit < at.merit) | (new.merit < floor)
         enough = jnp.where(better & (new.size < _FAST * at.size), small, smaller)
-        x, at = _where(better, (trial, new), (x, at))
+        x, at = select(better, (trial, new), (x, at))
         return x, at, jnp.where(better, jnp.ones_like(fraction), fraction / 4), enough, count + 1
 
     still = jax.tree.map(jnp.zeros_like, start)
@@ -215,13 +215,13 @@ def damped_newton(
             old.plain,
         )
         here = old._replace(damping=damping, fresh=plain)
-        guard = _where(taken, there, here)._replace(
+        guard = select(taken, there, here)._replace(
             spent=old.spent + 1, plain=old.plain + plain.astype(jnp.int32)
         )
         # a rejected step is computed again with more damping before it is used; that of a problem
         # that is done is never used
         go = pending(old)
-        return _where(go & taken, trial, x), new.step, _where(go, guard, old)
+        return select(go & taken, trial, x), new.step, select(go, guard, old)
 
     zero, no, none = (
         jnp.zeros_like(floor),
@@ -273,7 +273,3 @@ def _raised(damping: Array) -> Array:
 
 def _lowered(damping: Array) -> Array:
     return jnp.where(damping > 1e-2 * _MIN_DAMPING, damping / _LOWER, 0.0)
-
-
-def _where(condition: Array, a: Tree, b: Tree) -> Tree:
-    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
