@@ -8,6 +8,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import vsr_jax as vsr
+from vsr_jax.arm.routing import Routing
 
 ARM = vsr.Rod(0.3, vsr.Circular(0.01), vsr.Material(1e6, poisson=0.45, density=1000.0))
 STEPS = vsr.StrainDependent(8)
@@ -85,7 +86,7 @@ def test_friction_along_an_arc_is_the_closed_form():
         np.testing.assert_allclose(np.abs(eq.strain(X)[:, 2]) * EI / d, want, rtol=1e-7)
 
 
-class Corner(vsr.routing.Routing):
+class Corner(Routing):
     """Two straight lines of opposite slope."""
 
     slope: jax.Array

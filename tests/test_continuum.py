@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import vsr_jax as vsr
-from vsr_jax.models.continuum import strain_rate
+from vsr_jax.models.continuum import cosserat_strain_rate
 from vsr_jax.numerics import se3
 from vsr_jax.studies import paper
 
@@ -52,7 +52,7 @@ def test_right_side_is_eq_12_and_13_as_printed(case):
         xi = jnp.asarray(rng.normal(size=6)) * 0.2 + jnp.eye(6)[3]
         want = printed_rate(scene, tau, xi, jnp.asarray(X))
         np.testing.assert_allclose(
-            strain_rate(scene, tau, xi, jnp.asarray(X)), want, rtol=1e-10, atol=1e-10
+            cosserat_strain_rate(scene, tau, xi, jnp.asarray(X)), want, rtol=1e-10, atol=1e-10
         )
 
 

@@ -225,7 +225,7 @@ def test_precision_follows_the_inputs(dtype):
         (lambda: vsr.Legendre(2.5), r"Legendre\.order: got 2\.5"),
         (lambda: vsr.Trigonometric([], constant=False), "got no function"),
         (lambda: vsr.PiecewiseConstant(0), r"PiecewiseConstant\.sections: got 0"),
-        (lambda: vsr.PiecewiseConstant([0.7, 0.3]), "or rising fractions between 0 and 1"),
+        (lambda: vsr.PiecewiseConstant([0.7, 0.3]), "or ascending fractions between 0 and 1"),
         (lambda: vsr.FunctionBasis(lambda x: x, size=0), r"FunctionBasis\.size: got 0"),
     ],
 )

@@ -10,7 +10,7 @@ from conftest import epsilon
 
 import vsr_jax as vsr
 from vsr_jax.mechanics.balance import (
-    chosen,
+    free_components,
     residual,
     spread,
     thread_direction,
@@ -56,7 +56,7 @@ def bent(scene, size=1.0, model=MODEL):
         0.03 * jnp.sin(X),
         0.02 * jnp.cos(X),
     ]
-    moving = spread(chosen(tuple(waves), scene.free), scene.free)
+    moving = spread(free_components(tuple(waves), scene.free), scene.free)
     xi = tuple(
         jnp.broadcast_to(rest, X.shape) + size * wave
         for rest, wave in zip(sections.rest, moving, strict=True)
@@ -69,12 +69,12 @@ def dense(scene, forces, nodes):
     changes of strain are allowed."""
     grid, free = nodes.grid, scene.free
     loads, tau = loading(scene, grid), nodes.tau(forces)
-    still = jnp.stack(chosen(nodes.xi, free))
+    still = jnp.stack(free_components(nodes.xi, free))
 
     def imbalance(values):
         xi = with_locked(spread(tuple(values), free), nodes.xi, free)
         return jnp.stack(
-            chosen(residual(xi, nodes.sections, tau, react(xi, grid, loads).wrench), free)
+            free_components(residual(xi, nodes.sections, tau, react(xi, grid, loads).wrench), free)
         )
 
     jacobian = np.asarray(jax.jit(jax.jacfwd(imbalance))(still)).reshape(still.size, still.size)
@@ -82,7 +82,10 @@ def dense(scene, forces, nodes):
     root = np.sqrt(
         weight
         * np.stack(
-            [np.broadcast_to(s, grid.X.shape) for s in chosen(nodes.sections.stiffness, free)]
+            [
+                np.broadcast_to(s, grid.X.shape)
+                for s in free_components(nodes.sections.stiffness, free)
+            ]
         ).reshape(-1)
     )
     there = weight > 0
@@ -90,9 +93,9 @@ def dense(scene, forces, nodes):
     forbidden = [np.zeros((there.sum(), 0))]
     for place in scene.length_driven:
         path, reach = nodes.sections.paths[place], nodes.sections.reach[place]
-        unit = np.stack(chosen(thread_wrench(thread_direction(nodes.xi, path)[0], path), free)) * (
-            1.0 if reach is None else reach
-        )
+        unit = np.stack(
+            free_components(thread_wrench(thread_direction(nodes.xi, path)[0], path), free)
+        ) * (1.0 if reach is None else reach)
         if forces[place] < 0:
             forbidden.append(
                 ((np.asarray(grid.weight) * unit).reshape(-1)[there] / root[there])[:, None]

@@ -24,15 +24,15 @@ from jaxtyping import Array, Float
 
 from ..arm.scene import Scene
 from ..mechanics.arm_balance import (
+    ArmProblem,
+    ArmUnknown,
     Kind,
-    Problem,
-    Unknown,
     imbalance_of,
     problem_of,
     state_of,
     with_tensions,
 )
-from ..mechanics.balance import chosen, spread, with_locked
+from ..mechanics.balance import free_components, spread, with_locked
 from ..models.base import Outcome, Status, resolved
 from ..models.strain_dependent import StrainDependent
 from ..solution.equilibrium import Equilibrium
@@ -148,11 +148,11 @@ class _System(NamedTuple):
     model: StrainDependent
     scale: Array
 
-    def problem(self, s: Array) -> tuple[Problem, Kind]:
+    def problem(self, s: Array) -> tuple[ArmProblem, Kind]:
         scene, inputs = _at(self.scene, self.path, s)
         return problem_of(scene, inputs, self.model.grid(scene))
 
-    def unknown(self, u: Array, problem: Problem, kind: Kind) -> Unknown:
+    def unknown(self, u: Array, problem: ArmProblem, kind: Kind) -> ArmUnknown:
         """The unknowns as a structure; locked strains have their rest value."""
         shape, size = problem.grid.X.shape, problem.grid.X.size
         values = u[:-1] / self.scale
@@ -160,7 +160,7 @@ class _System(NamedTuple):
         xi = with_locked(spread(tuple(strain), kind.free), problem.sections.rest, kind.free)
         rest = values[strain.size :]
         tension, turning = rest[: len(kind.cables)], rest[len(kind.cables) :].reshape(-1, *shape)
-        return Unknown(xi, tuple(tension), tuple(turning))
+        return ArmUnknown(xi, tuple(tension), tuple(turning))
 
     def residual(self, u: Array) -> Array:
         """Gradient of a dimensionless energy with respect to the unknowns in `u`."""
@@ -184,7 +184,7 @@ def _system(scene: SceneOrPath, path: InputPath, start: Equilibrium) -> tuple[_S
     turning = start.state.turning
     parts = [
         (x, share * length if i < 3 else share)
-        for i, x in zip(kind.free, chosen(start.state.xi, kind.free), strict=True)
+        for i, x in zip(kind.free, free_components(start.state.xi, kind.free), strict=True)
     ]
     parts += [(x, 1 / axial) for x in tension] + [(x, share * length) for x in turning]
     values, scale = (

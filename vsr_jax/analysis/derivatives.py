@@ -15,8 +15,9 @@ from jaxtyping import Array, Float
 from ..arm.loads import TipWrench
 from ..arm.scene import Scene
 from ..arm.scene_numbers import parameters, replaced
-from ..mechanics.balance import chosen_rows, tangent
+from ..mechanics.balance import free_block, tangent
 from ..numerics import component as c
+from ..numerics.se3 import unskew
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
 from ..typing import Pose
@@ -104,10 +105,7 @@ def _by_numbers(eq: Equilibrium) -> tuple[Array, Array, Array]:
 def _motion(tip: Pose, here: Pose) -> Float[Array, "6"]:
     """Rotation and displacement from a nearby pose, to first order, in the world's axes."""
     turn = tip[:3, :3] @ jax.lax.stop_gradient(here)[:3, :3].T
-    axis = 0.5 * jnp.stack(
-        [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
-    )
-    return jnp.concatenate([axis, tip[:3, 3] - jax.lax.stop_gradient(here)[:3, 3]])
+    return jnp.concatenate([unskew(turn), tip[:3, 3] - jax.lax.stop_gradient(here)[:3, 3]])
 
 
 def tip_jacobian(eq: Equilibrium) -> Float[Array, "6 inputs"]:
@@ -154,7 +152,7 @@ def _compliance(eq: Equilibrium) -> Array:
         return jnp.where(eq.converged, found, jnp.nan)
     nodes, free = eq.nodes, jnp.array(eq.scene.free)
     rows = tangent(nodes.xi, nodes.sections, nodes.tau(eq.sound_forces))
-    H = c.join_matrix(c.symmetric(chosen_rows(rows, eq.scene.free))).reshape(
+    H = c.join_matrix(c.symmetric(free_block(rows, eq.scene.free))).reshape(
         -1, free.size, free.size
     )
     poses = eq.pose(nodes.grid.X.reshape(-1))

@@ -18,7 +18,7 @@ from jaxtyping import Array
 from ..arm.loads import Frame, Load
 from ..arm.rod import Rod
 from ..arm.scene import Scene
-from ..mechanics.balance import chosen, thread_direction, thread_wrench
+from ..mechanics.balance import free_components, thread_direction, thread_wrench
 from ..models.base import Model, Status
 from ..numerics.component import Wrench, norm, scale, split
 from ..numerics.quadrature import make_grid
@@ -158,11 +158,11 @@ def _independence(scene: Scene) -> Scalar:
         thread_wrench(thread_direction(sections.rest, path)[0], path) for path in sections.paths
     ]
     wrenches = [
-        chosen(w if reach is None else scale(reach, w), scene.free)
+        free_components(w if reach is None else scale(reach, w), scene.free)
         for w, reach in zip(wrenches, sections.reach, strict=True)
     ]
     B = jnp.stack([jnp.stack(jnp.broadcast_arrays(*w)) for w in wrenches])
-    stiffness = jnp.stack(jnp.broadcast_arrays(*chosen(sections.stiffness, scene.free)))
+    stiffness = jnp.stack(jnp.broadcast_arrays(*free_components(sections.stiffness, scene.free)))
     K = jnp.einsum("iask,jask,ask,sk->ij", B, B, 1 / stiffness, grid.weight)
     size = jnp.sqrt(jnp.diag(K))
     return jnp.linalg.eigvalsh(K / (size[:, None] * size[None, :]))[0]

@@ -235,7 +235,7 @@ def _moving(problem: _ReachProblem, found: bounded_least_squares.Nearest) -> Arr
     """The shares found, with the derivatives of the stationary point for the last weight."""
 
     def half(share: Array) -> Array:
-        effort = bounded_least_squares.weight(share.dtype) * (share - problem.idle)
+        effort = bounded_least_squares.last_weight(share.dtype) * (share - problem.idle)
         return (jnp.sum(problem.residual(share) ** 2) + jnp.sum(effort**2)) / 2
 
     def slope(share: Array) -> Array:

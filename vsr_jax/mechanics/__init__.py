@@ -1,8 +1,8 @@
-"""The equations of balance of an arm and their linearisations: sections, internal reaction, cables,
-friction, the arm as a whole.
+"""The equilibrium equations of an arm and their linearisations: cross-sections, internal reaction,
+cables, friction, the whole arm.
 
-Works on arrays of stiffnesses, strains and thread paths at quadrature points. Must not know which
-model asks.
+Works on arrays of stiffnesses, strains and thread paths at quadrature points, and is independent of
+the models.
 """
 
 from .balance import residual, tangent

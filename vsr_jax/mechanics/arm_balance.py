@@ -1,14 +1,14 @@
-r"""The balance of all cross-sections of an arm together, where loads, given thread lengths or
-friction tie them to each other.
+r"""The balance of all cross-sections of an arm, coupled by loads, prescribed thread lengths or
+friction.
 
-Unknown are the strain at the nodes, the tension T of each tendon driven by its length, and the rate
-$\varphi'$ at which each tendon with friction turns. The residual is that of eq. 21 at each node,
-with the reaction and the tensions that belong to the unknowns; for each tendon driven by its length
+The unknowns are the strain at the nodes, the tension T of each tendon with prescribed length, and
+the turning rate $\varphi'$ of the path of each tendon with friction. The residual is eq. 21 at each
+node, with the reaction and the tensions of the unknowns; for each tendon with prescribed length
 
 $$\min(T, k_0 s) = 0, \quad s = (l^* + \delta)(1 + T / k) - l,$$
 
-the complementarity of tension and slack, with a stiffness $k_0$ [N/m] that only makes the two
-comparable; and for each tendon with friction the rate less that of its path.
+the complementarity of tension and slack, where the stiffness $k_0$ [N/m] only scales the two; and
+for each tendon with friction the difference between the unknown rate and that of its path.
 """
 
 from collections.abc import Iterable
@@ -21,78 +21,85 @@ from jaxtyping import Array
 from ..arm.actuator import Tendon
 from ..arm.scene import CrossSections, Scene, shared
 from ..numerics import component as c
-from ..numerics.component import Vector
+from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import Grid
-from .balance import chosen, residual, thread_direction, thread_wrench
+from .balance import free_components, residual, thread_direction, thread_wrench, without_force
 from .cable import Cable, cable_of, path_length
 from .friction import (
     Friction,
+    balanced_strain_rate,
     breaks_of,
     decay_at,
     kinks_of,
     reaction_rate,
     share_left,
-    strain_rate,
     turning_rate,
 )
 from .reaction import Loading, Reaction, loading, react
 
 
-class Problem(NamedTuple):
-    """What is to be balanced: `forces` of the threads at their start (ignored for cables), and what
-    ties the sections."""
+class ArmProblem(NamedTuple):
+    """Data of the coupled balance: `forces` of the threads at their start (ignored for cables), and
+    what couples the sections."""
 
     grid: Grid
     sections: CrossSections
-    forces: Vector
+    forces: Forces
     loads: Loading | None
     cables: tuple[Cable, ...]
     friction: Friction | None
 
-    def with_share(self, share: Array) -> "Problem":
-        """The problem with a share of its loads."""
+    def with_share(self, share: Array) -> "ArmProblem":
+        """The problem with a fraction of its loads."""
         return self if self.loads is None else self._replace(loads=self.loads.scaled(share))
+
+    def at_rest(self) -> "ArmProblem":
+        """The problem without loads and forces and with slack cables, so that its solution is the
+        rest strain."""
+        cables = tuple(cable._replace(length=2 * cable.length) for cable in self.cables)
+        loads = None if self.loads is None else self.loads.absent()
+        return self._replace(forces=without_force(self.forces), cables=cables, loads=loads)
 
 
 class Kind(NamedTuple):
-    """Static facts of a problem: places of the free strains, of the threads that are cables, of
-    those with friction."""
+    """Static structure of a problem: indices of the free strains, of the threads that are cables,
+    and of those with friction."""
 
     free: tuple[int, ...]
     cables: tuple[int, ...]
     frictional: tuple[int, ...]
 
 
-class Unknown(NamedTuple):
+class ArmUnknown(NamedTuple):
     r"""Strain at the nodes (six component arrays), tension [N] of each cable, $\varphi'$ [rad/m] at
     the nodes of each tendon with friction."""
 
     xi: Vector
-    tension: Vector
+    tension: Forces
     turning: Vector
 
 
-class Imbalance(NamedTuple):
+class ArmImbalance(NamedTuple):
     """Residual: wrench at the nodes for the free strains, force of each cable [N], turning rate of
     each tendon with friction."""
 
     wrench: Vector
-    cable: Vector
+    cable: Forces
     turning: Vector
 
 
-class State(NamedTuple):
-    """What follows from the unknowns: share of each thread's force at the nodes (None for all), its
-    force there, the reaction, the slack of each cable [m]."""
+class ArmState(NamedTuple):
+    """Quantities computed from the unknowns: share of each thread's force at the nodes (None for
+    1), its force there, the reaction, the slack of each cable [m]."""
 
     carried: tuple[Array | None, ...]
-    tau: Vector
+    tau: Forces
     along: Reaction | None
     slack: Vector
 
 
-def problem_of(scene: Scene, inputs: Array, grid: Grid) -> tuple[Problem, Kind]:
-    """What is to be balanced on a grid."""
+def problem_of(scene: Scene, inputs: Array, grid: Grid) -> tuple[ArmProblem, Kind]:
+    """The coupled balance of a scene on a grid."""
     sections, forces = scene.sections(grid.X), scene.forces(inputs)
     cables = [
         cable_of(scene, inputs[place], place, sections, grid) for place in scene.length_driven
@@ -105,44 +112,20 @@ def problem_of(scene: Scene, inputs: Array, grid: Grid) -> tuple[Problem, Kind]:
             rate,
             breaks_of(scene.breakpoints, grid),
         )
-    problem = Problem(grid, sections, forces, loading(scene, grid), tuple(cables), friction)
+    problem = ArmProblem(grid, sections, forces, loading(scene, grid), tuple(cables), friction)
     return problem, Kind(scene.free, scene.length_driven, scene.frictional)
 
 
-def with_tensions(forces: Vector, tensions: Iterable[Array], kind: Kind) -> Vector:
-    """Force of every thread at its start: as given, or minus the tension that was found."""
+def with_tensions(forces: Forces, tensions: Iterable[Array], kind: Kind) -> Forces:
+    """Force of every thread at its start: as given, or minus the tension of a cable."""
     found = list(forces)
     for place, tension in zip(kind.cables, tensions, strict=True):
         found[place] = -tension
     return tuple(found)
 
 
-def harmless(problem: Problem, sound: Array) -> Problem:
-    """The problem where its solution is sound, and elsewhere one that is at rest: no loads and
-    forces, slack cables."""
-    forces = tuple(jnp.where(sound, f, 0.0) for f in problem.forces)
-    cables = tuple(
-        cable._replace(length=jnp.where(sound, cable.length, 2 * cable.length))
-        for cable in problem.cables
-    )
-    loads = problem.loads
-    if loads is not None:
-        dead, density, follower = (_where(sound, part) for part in loads[:3])
-        points = tuple(
-            point._replace(wrench=_where(sound, point.wrench)) for point in loads.follower_points
-        )
-        loads = loads._replace(
-            dead=dead, dead_density=density, follower_density=follower, follower_points=points
-        )
-    return problem._replace(forces=forces, cables=cables, loads=loads)
-
-
-def _where(sound: Array, wrench: Vector | None) -> Vector | None:
-    return None if wrench is None else tuple(jnp.where(sound, x, 0.0) for x in wrench)
-
-
-def state_of(unknown: Unknown, problem: Problem, kind: Kind) -> State:
-    """What follows from the unknowns."""
+def state_of(unknown: ArmUnknown, problem: ArmProblem, kind: Kind) -> ArmState:
+    """Quantities computed from the unknowns."""
     grid, sections, xi = problem.grid, problem.sections, unknown.xi
     carried = list(sections.reach)
     if problem.friction is not None:
@@ -158,7 +141,7 @@ def state_of(unknown: Unknown, problem: Problem, kind: Kind) -> State:
         cable.slack(tension, path_length(xi, sections, place, grid), carried[place], grid)
         for place, cable, tension in zip(kind.cables, problem.cables, unknown.tension, strict=True)
     )
-    return State(tuple(carried), tau, along, slack)
+    return ArmState(tuple(carried), tau, along, slack)
 
 
 def shares_at(
@@ -172,11 +155,9 @@ def shares_at(
     sections, breaks = scene.sections(grid.X), breaks_of(scene.breakpoints, grid)
     for place, rate in zip(scene.frictional, turning, strict=True):
         reach, kinks = sections.reach[place], kinks_of(xi, sections, breaks, place, grid)
-        left = decay_at(
-            rate if reach is None else reach * rate, kinks, _signed_friction(scene, place), grid, X
-        )
-        here = shares[place]
-        shares[place] = left if here is None else here * left
+        rate = c.times(reach, rate)
+        left = decay_at(rate, kinks, _signed_friction(scene, place), grid, X)
+        shares[place] = c.times(shares[place], left)
     return tuple(shares)
 
 
@@ -187,22 +168,24 @@ def _signed_friction(scene: Scene, place: int) -> Array:
     return tendon.friction if tendon.motion == "pull" else -tendon.friction
 
 
-def imbalance_of(unknown: Unknown, at: State, problem: Problem, kind: Kind) -> Imbalance:
+def imbalance_of(
+    unknown: ArmUnknown, at: ArmState, problem: ArmProblem, kind: Kind
+) -> ArmImbalance:
     """The residual."""
     wrench = None if at.along is None else at.along.wrench
-    r = chosen(residual(unknown.xi, problem.sections, at.tau, wrench), kind.free)
+    r = free_components(residual(unknown.xi, problem.sections, at.tau, wrench), kind.free)
     cables = tuple(
         cable.complementarity(tension, slack)
         for cable, tension, slack in zip(problem.cables, unknown.tension, at.slack, strict=True)
     )
     if problem.friction is None:
-        return Imbalance(r, cables, ())
+        return ArmImbalance(r, cables, ())
     rates = _turning_rates(unknown, at, problem, problem.friction, kind)
-    return Imbalance(r, cables, c.subtract(unknown.turning, rates))
+    return ArmImbalance(r, cables, c.subtract(unknown.turning, rates))
 
 
 def _turning_rates(
-    unknown: Unknown, at: State, problem: Problem, friction: Friction, kind: Kind
+    unknown: ArmUnknown, at: ArmState, problem: ArmProblem, friction: Friction, kind: Kind
 ) -> Vector:
     xi, sections, loads = unknown.xi, problem.sections, problem.loads
     slopes = [jnp.zeros_like(xi[0])] * len(at.tau)
@@ -214,7 +197,7 @@ def _turning_rates(
     if at.along is not None and loads is not None:
         change = reaction_rate(xi, at.along.wrench, at.along.body_density)
     tau = tuple(jnp.broadcast_to(force, xi[0].shape) for force in at.tau)
-    xi_rate = strain_rate(
+    xi_rate = balanced_strain_rate(
         xi, tau, tuple(slopes), change, sections, friction.sections_rate, kind.free
     )
     return tuple(
@@ -224,33 +207,32 @@ def _turning_rates(
 
 
 def shape_size(strain: Vector, length: Array) -> Array:
-    r"""Size of a change of strain by the shape it makes, $\sqrt{L^2 |\kappa|^2 + |\upsilon|^2}$:
-    turn over the arm's length, and strain.
+    r"""Size of a change of strain by its effect on the shape, $\sqrt{L^2 |\kappa|^2 +
+    |\upsilon|^2}$: rotation over the length of the arm, and strain.
 
-    In energies the bending of a slender arm would count for nothing: at L/r = 1000 a strain of 1e-6
-    in its fibres turns its tip by a thousandth.
+    An energy norm would underrate the bending of a slender arm: at L/r = 1000 a strain of 1e-6 in
+    its fibres rotates the tip by 1e-3.
     """
     return jnp.sqrt(length**2 * c.dot(strain[:3], strain[:3]) + c.dot(strain[3:], strain[3:]))
 
 
 def shape_of(wrench: Vector, stiffness: Vector, length: Array) -> Array:
-    """`shape_size` of the strain that a wrench makes at rest."""
+    """`shape_size` of the strain that a wrench causes at rest."""
     return shape_size(tuple(f / s for f, s in zip(wrench, stiffness, strict=True)), length)
 
 
 def pull_of(sections: CrossSections, place: int, length: Array) -> Array:
-    """`shape_size` of the strain that a unit of a thread's force makes at rest [1/N]."""
+    """`shape_size` of the strain per unit of a thread's force at rest [1/N]."""
     path = sections.paths[place]
     return shape_of(
         thread_wrench(thread_direction(sections.rest, path)[0], path), sections.stiffness, length
     )
 
 
-def rounding_of(problem: Problem) -> Array:
-    """What is left of the `shape_size` of a balanced residual in floating point, of the shape of
-    the arms side by side.
+def rounding_of(problem: ArmProblem) -> Array:
+    """Rounding error of the `shape_size` of a balanced residual, one entry per arm of a batch.
 
-    A multiple of the machine's epsilon by the sizes of what is in balance: threads, loads and
+    A multiple of the machine epsilon times the sizes of the terms in balance: threads, loads and
     curvature at rest.
     """
     sections, loads, length = problem.sections, problem.loads, jnp.sum(problem.grid.h, axis=0)

@@ -1,5 +1,5 @@
-r"""Solution of the coupled balance (see `coupled`): damped Newton steps with a tangent that is
-nearly exact, and implicit derivatives."""
+r"""Solution of the coupled balance (see `arm_balance`): damped Newton steps with a nearly exact
+tangent, and implicit derivatives."""
 
 from functools import partial
 from typing import NamedTuple
@@ -12,17 +12,16 @@ from ..arm.scene import CrossSections
 from ..numerics import component as c
 from ..numerics.batching import arms_in, side_by_side
 from ..numerics.component import Vector
-from ..numerics.implicit import change_of, no_derivative
-from ..numerics.newton import LOAD_SHARES, MOST_TURN, Damped, Solution, damped_newton
+from ..numerics.implicit import implicit_root
+from ..numerics.newton import LOAD_INCREMENTS, MAX_TURN, Damped, Root, damped_newton
 from ..numerics.quadrature import Grid
 from ..typing import cast
 from .arm_balance import (
-    Imbalance,
+    ArmImbalance,
+    ArmProblem,
+    ArmState,
+    ArmUnknown,
     Kind,
-    Problem,
-    State,
-    Unknown,
-    harmless,
     imbalance_of,
     pull_of,
     rounding_of,
@@ -32,68 +31,50 @@ from .arm_balance import (
     with_tensions,
 )
 from .arm_tangent import approximate_solve, tangent_solve
-from .balance import chosen, solve_balance, spread, with_locked
+from .balance import (
+    completed,
+    free_components,
+    largest_force_scale,
+    solve_balance,
+    spread,
+    with_locked,
+)
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(1,))
-def solve_arm(problem: Problem, kind: Kind) -> Solution:
-    """Equilibrium of the arm, from the balance without loads and with slack cables.
+def solve_arm(problem: ArmProblem, kind: Kind) -> Root:
+    """Equilibrium of the arm; its point is an `ArmUnknown`. Newton's method starts from the balance
+    without loads and with slack cables.
 
-    Derivatives are implicit, of any order, in forward and reverse mode: the exact tangent is solved
-    by refining `approximate_solve`.
+    Derivatives are implicit, of any order, in forward and reverse mode: the exact tangent system is
+    solved by iterative refinement of `approximate_solve`.
     """
-    return side_by_side(partial(_solve, kind))(_start(problem, kind), problem)
 
+    def find(problem: ArmProblem) -> Root:
+        root = side_by_side(partial(_solve, kind))(_start(problem, kind), problem)
+        return root._replace(x=root.x._replace(xi=free_components(root.x.xi, kind.free)))
 
-@partial(solve_arm.defjvp, symbolic_zeros=True)
-def _solve_arm_jvp(
-    kind: Kind, primals: tuple[Problem], tangents: tuple[Problem]
-) -> tuple[Solution, Solution]:
-    solution = solve_arm(primals[0], kind)
-    # Where nothing was found there is no derivative: take it at rest without loads and forces,
-    # where it is finite.
-    sound = solution.balanced & solution.definite
+    def whole(x: ArmUnknown, problem: ArmProblem) -> ArmUnknown:
+        return x._replace(xi=completed(x.xi, problem.sections.rest, kind.free))
 
-    def placed(change: Imbalance, problem: Problem) -> Unknown:
-        """Unknowns at the solution plus a change of those that are solved for; locked strains are
-        those of the rod at rest."""
-        rest = problem.sections.rest
-        xi = tuple(
-            jnp.where(sound, x, jnp.broadcast_to(r, x.shape))
-            for x, r in zip(solution.unknown.xi, rest, strict=True)
-        )
-        xi = with_locked(c.add(xi, spread(change.wrench, kind.free)), rest, kind.free)
-        others = (tuple(jnp.where(sound, x, 0.0) for x in part) for part in solution.unknown[1:])
-        tension, turning = (c.add(x, dx) for x, dx in zip(others, change[1:], strict=True))
-        return Unknown(xi, tension, turning)
-
-    def imbalance(change: Imbalance, problem: Problem) -> Imbalance:
-        unknown, problem = placed(change, problem), harmless(problem, sound)
+    def imbalance(x: ArmUnknown, problem: ArmProblem) -> ArmImbalance:
+        unknown = whole(x, problem)
         return imbalance_of(unknown, state_of(unknown, problem, kind), problem, kind)
 
-    free, others = chosen(solution.unknown.xi, kind.free), solution.unknown[1:]
-    still = jax.tree.map(jnp.zeros_like, Imbalance(free, *others))
-    right = change_of(lambda problem: imbalance(still, problem), primals, tangents)
-    change = tangent_solve(
-        lambda change: imbalance(change, primals[0]),
-        placed(still, primals[0]),
-        harmless(primals[0], sound),
-        right,
-        kind,
-    )
-    # the rods' own rest strain moves the locked strains
-    locked = change_of(lambda problem: placed(still, problem).xi, primals, tangents)
-    moved = spread(c.scale(-1.0, change.wrench), kind.free)
-    d_unknown = Unknown(
-        with_locked(moved, locked, kind.free),
-        c.scale(-1.0, change.cable),
-        c.scale(-1.0, change.turning),
-    )
-    return solution, Solution(d_unknown, *no_derivative(*solution[1:]))
+    def linear_solve(x: ArmUnknown, problem: ArmProblem, right: ArmImbalance) -> ArmUnknown:
+        _, apply = jax.linearize(lambda x: imbalance(x, problem), x)
+        return tangent_solve(apply, whole(x, problem), problem, right, kind)
+
+    def at_rest(x: ArmUnknown, problem: ArmProblem) -> tuple[ArmUnknown, ArmProblem]:
+        zero = jax.tree.map(jnp.zeros_like, x)
+        rest = free_components(problem.sections.rest, kind.free)
+        return zero._replace(xi=rest), problem.at_rest()
+
+    root = implicit_root(find, imbalance, linear_solve, at_rest, problem)
+    return root._replace(x=whole(root.x, problem))
 
 
-def _start(problem: Problem, kind: Kind) -> Unknown:
-    """Balance of each section alone, without loads, cables slack and without friction, in single
+def _start(problem: ArmProblem, kind: Kind) -> ArmUnknown:
+    """Balance of each section alone, without loads and friction and with slack cables, in single
     precision."""
     tension = (jnp.zeros_like(problem.grid.h[0]),) * len(kind.cables)
     tau = problem.sections.carry(with_tensions(problem.forces, tension, kind))
@@ -103,12 +84,12 @@ def _start(problem: Problem, kind: Kind) -> Unknown:
     xi = tuple(
         jnp.where(sound, x.astype(x0.dtype), x0) for x, x0 in zip(alone.xi, rest, strict=True)
     )
-    xi = with_locked(xi, rest, kind.free)  # these are never corrected
-    return Unknown(xi, tension, (jnp.zeros_like(xi[0]),) * len(kind.frictional))
+    xi = with_locked(xi, rest, kind.free)  # the iteration does not change these
+    return ArmUnknown(xi, tension, (jnp.zeros_like(xi[0]),) * len(kind.frictional))
 
 
 class _Sizes(NamedTuple):
-    """Sizes of steps and imbalances without unit, one for each of the arms side by side (see
+    """Dimensionless sizes of steps and residuals, one entry per arm of a batch (see
     `shape_size`)."""
 
     grid: Grid
@@ -120,9 +101,8 @@ class _Sizes(NamedTuple):
     def length(self) -> Array:
         return jnp.sum(self.grid.h, axis=0)
 
-    def of_step(self, step: Unknown, at: State) -> Array:
-        """Largest change of the shape, of what a tension does to it, or of what friction takes of
-        one."""
+    def of_step(self, step: ArmUnknown, at: ArmState) -> Array:
+        """Largest change of the shape, plus that by tensions and by friction."""
         step = cast(step, self.grid.h.dtype)
         tensions = [
             tension * pull_of(self.sections, place, self.length)
@@ -131,32 +111,34 @@ class _Sizes(NamedTuple):
         moved = self._largest(shape_size(step.xi, self.length))
         return sum((self._largest(x) for x in (*tensions, *self._rubbed(step.turning, at))), moved)
 
-    def of_imbalance(self, imbalance: Imbalance, at: State) -> Array:
-        """Root of the mean square of all rows; a cable's is its slack by the arm's length."""
+    def of_imbalance(self, imbalance: ArmImbalance, at: ArmState) -> Array:
+        """Root mean square of all rows; that of a cable is its slack per length of the arm."""
         wrench = spread(imbalance.wrench, self.kind.free)
         bent = shape_of(wrench, self.sections.stiffness, self.length)
         square = jnp.sum(self.grid.weight * bent**2, axis=(0, 1)) / self.length
-        axial = jnp.max(self.sections.stiffness[3], axis=(0, 1))
+        axial = largest_force_scale(self.sections.stiffness)
         others = (
             *(force / axial for force in imbalance.cable),
             *self._rubbed(imbalance.turning, at),
         )
         return jnp.sqrt(sum((jnp.mean(x**2, axis=self._inner(x)) for x in others), square))
 
-    def turn(self, step: Unknown) -> Array:
-        """How far the step bends and twists the arm in all [rad]."""
+    def turn(self, step: ArmUnknown) -> Array:
+        """Total angle by which the step bends and twists the arm [rad]."""
         x, y, z = (jnp.abs(k) for k in cast(step.xi[:3], self.grid.h.dtype))
         return jnp.sum(self.grid.weight * (x + y + z), axis=(0, 1))
 
-    def work(self, wrench: Vector, step: Unknown) -> Array:
-        """Work of the imbalance over a step; only its sign and its rough size matter."""
+    def work(self, wrench: Vector, step: ArmUnknown) -> Array:
+        """Work of the residual over a step, in single precision: only its sign and rough size
+        matter."""
         work = jnp.sum(
-            c.single(self.grid.weight) * c.dot(wrench, chosen(step.xi, self.kind.free)), axis=(0, 1)
+            c.single(self.grid.weight) * c.dot(wrench, free_components(step.xi, self.kind.free)),
+            axis=(0, 1),
         )
         return work.astype(self.grid.h.dtype)
 
-    def _rubbed(self, rates: Vector, at: State) -> list[Array]:
-        """Changes of turning rates by what they make of the tensions."""
+    def _rubbed(self, rates: Vector, at: ArmState) -> list[Array]:
+        """Changes of turning rates, scaled by their effect on the tensions."""
         pulls = [pull_of(self.sections, place, self.length) for place in self.kind.frictional]
         return [
             self.length * at.tau[p] * rate * pull
@@ -170,27 +152,27 @@ class _Sizes(NamedTuple):
         return jnp.max(jnp.abs(x), axis=self._inner(x))
 
 
-def _solve(kind: Kind, start: Unknown, whole: Problem) -> Solution:
+def _solve(kind: Kind, start: ArmUnknown, whole: ArmProblem) -> Root:
     arms = arms_in((start, whole), whole.grid.h.ndim - 1)
     start = jax.tree.map(
         lambda x: jnp.broadcast_to(x, (*x.shape[: x.ndim - len(arms)], *arms)), start
     )
     sizes = _Sizes(whole.grid, whole.sections, kind, arms)
 
-    def evaluate(unknown: Unknown, damping: Array, share: Array) -> Damped:
+    def evaluate(unknown: ArmUnknown, damping: Array, share: Array) -> Damped:
         problem = whole.with_share(share)
         at = state_of(unknown, problem, kind)
         imbalance = imbalance_of(unknown, at, problem, kind)
         step, definite = approximate_solve(unknown, at, imbalance, problem, kind, damping)
         size = sizes.of_step(step, at)
-        # A step that coils the arm may well lower the residual, and lead nowhere.
-        cut = jnp.minimum(1.0, MOST_TURN / jnp.maximum(sizes.turn(step), MOST_TURN))
+        # A step that coils the arm may lower the residual without approaching a solution.
+        cut = jnp.minimum(1.0, MAX_TURN / jnp.maximum(sizes.turn(step), MAX_TURN))
         step = jax.tree.map(lambda x: cut.astype(x.dtype) * x, step)
         return Damped(
             step, size, c.single(imbalance.wrench), sizes.of_imbalance(imbalance, at), definite
         )
 
-    shares = 1 if whole.loads is None else LOAD_SHARES
+    shares = 1 if whole.loads is None else LOAD_INCREMENTS
     return damped_newton(
         evaluate, sizes.work, start, jnp.broadcast_to(rounding_of(whole), arms), shares
     )

@@ -1,5 +1,5 @@
-"""The tangent system of the coupled balance (see `coupled`): solved nearly, by elimination, and
-exactly, by refining that."""
+"""The tangent system of the coupled balance (see `arm_balance`): solved approximately by
+elimination, and exactly by iterative refinement."""
 
 from collections.abc import Callable
 
@@ -12,34 +12,33 @@ from jaxtyping import Array
 from ..numerics import component as c, lu
 from ..numerics.component import Vector
 from ..typing import cast
-from .arm_balance import Imbalance, Kind, Problem, State, Unknown, state_of
-from .balance import chosen, spread, tangent, thread_direction, thread_wrench
+from .arm_balance import ArmImbalance, ArmProblem, ArmState, ArmUnknown, Kind, state_of
+from .balance import free_components, spread, tangent, thread_direction, thread_wrench
 from .elimination import eliminate
 
 _REFINEMENTS = 60
-"""Bound on the steps that refine the solution of a tangent system; five to ten are usual."""
+"""Bound on the refinement steps of a tangent system; 5 to 10 are usual."""
 
 _KEPT = 8
-"""Number of earlier directions to which each new residual is made orthogonal."""
+"""Number of earlier directions against which each new one is orthogonalised."""
 
 _FINAL, _ACCEPTED = 8.0, 1e4
-"""Residual at which refining ends and residual up to which the solution is accepted, in machine
-epsilons."""
+"""Residual at which refinement ends, and largest accepted residual, in machine epsilons."""
 
 
 def approximate_solve(
-    unknown: Unknown,
-    at: State,
-    right: Imbalance,
-    problem: Problem,
+    unknown: ArmUnknown,
+    at: ArmState,
+    right: ArmImbalance,
+    problem: ArmProblem,
     kind: Kind,
     damping: Array | float = 0.0,
-) -> tuple[Unknown, Array]:
-    """Solution of the tangent system, nearly (see `elimination`; friction's own tangent is left
-    out), and whether it is definite for the changes of shape that taut cables allow.
+) -> tuple[ArmUnknown, Array]:
+    """Approximate solution of the tangent system (see `elimination`; the tangent of friction is
+    neglected), and whether it is definite for the changes of shape that taut cables allow.
 
-    In single precision throughout, the solution too: the passes along the arm move memory more than
-    they compute, and what is lost is far less than what the elimination leaves out.
+    In single precision throughout: the passes along the arm are bound by memory, and rounding is
+    far below the error of the elimination.
     """
     unknown, at, right, problem, damping = c.single(
         (unknown, at, right, problem, jnp.asarray(damping))
@@ -55,13 +54,13 @@ def approximate_solve(
 
     strain, negative = solve(spread(right.wrench, kind.free))
     if not kind.cables:
-        return Unknown(strain, (), right.turning), negative == 0
+        return ArmUnknown(strain, (), right.turning), negative == 0
     units = [
         thread_wrench(thread_direction(unknown.xi, sections.paths[i])[0], sections.paths[i])
         for i in kind.cables
     ]
-    pulls = [_times(at.carried[i], unit) for i, unit in zip(kind.cables, units, strict=True)]
-    lengths = [_times(sections.reach[i], unit) for i, unit in zip(kind.cables, units, strict=True)]
+    pulls = [c.times(at.carried[i], unit) for i, unit in zip(kind.cables, units, strict=True)]
+    lengths = [c.times(sections.reach[i], unit) for i, unit in zip(kind.cables, units, strict=True)]
     answers, _ = jax.vmap(solve)(jax.tree.map(lambda *v: jnp.stack(v), *pulls))
     shortening = jnp.stack(
         [jnp.sum(grid.weight * c.dot(length, answers), axis=(1, 2)) for length in lengths]
@@ -74,29 +73,24 @@ def approximate_solve(
         a - jnp.sum(tension[:, None, None] * answer, axis=0)
         for a, answer in zip(strain, answers, strict=True)
     )
-    return Unknown(strain, tuple(tension), right.turning), negative == held
-
-
-def _times(share: Array | None, wrench: Vector) -> Vector:
-    return wrench if share is None else c.scale(share, wrench)
+    return ArmUnknown(strain, tuple(tension), right.turning), negative == held
 
 
 def _tensions(
-    unknown: Unknown,
-    at: State,
-    right: Imbalance,
-    problem: Problem,
+    unknown: ArmUnknown,
+    at: ArmState,
+    right: ArmImbalance,
+    problem: ArmProblem,
     kind: Kind,
     shortening: Array,
     given: Array,
 ) -> tuple[Array, Array]:
-    """Tensions of the cables from the equations left when the strain is eliminated, and the number
-    of negative pivots of these.
+    """Tensions of the cables from the Schur complement of the strains, and the number of its
+    negative pivots.
 
-    `shortening`: by each cable of each. Taut cables hold as many motions in which the arm alone
-    would fall as these equations have negative pivots: no more are left where the tangent has no
-    more negative eigenvalues.
-    """
+    `shortening`: of each cable's path per tension of each. Each negative pivot is an unstable
+    motion of the arm alone that taut cables prevent: the arm is stable if the tangent has no more
+    negative eigenvalues than that."""
     rows, sides = [], []
     for i, (place, cable, tension, slack) in enumerate(
         zip(kind.cables, problem.cables, unknown.tension, at.slack, strict=True)
@@ -115,36 +109,35 @@ def _tensions(
 
 
 def tangent_solve(
-    imbalance: Callable, unknown: Unknown, problem: Problem, right: Imbalance, kind: Kind
-) -> Imbalance:
+    apply: Callable, unknown: ArmUnknown, problem: ArmProblem, right: ArmImbalance, kind: Kind
+) -> ArmUnknown:
     r"""Solution of the exact tangent system $A x = b$, with `approximate_solve` as preconditioner;
-    NaN where it is not found.
+    NaN where not found.
 
-    Everything is scaled by energies: a change of strain $\delta\xi$ becomes $\sqrt{\Sigma
+    All entries are scaled by energies: a change of strain $\delta\xi$ becomes $\sqrt{\Sigma
     w}\,\delta\xi$, a wrench $\sqrt{w / \Sigma}\,r$, with the weight w of its node, and tensions and
-    turning rates likewise. The scaled A is the identity plus what loads and threads add, symmetric
-    where these have a potential, and its transpose is of the same kind. So one norm serves both
-    modes of differentiation.
-    """
-    still = jax.tree.map(jnp.zeros_like, right)
-    _, matvec = jax.linearize(imbalance, still)
-    at = state_of(unknown, problem, kind)
-    to_row, to_change = lax.stop_gradient(_units(problem, kind, still))
-    _, unravel = ravel_pytree(still)
+    turning rates likewise. The scaled A is the identity plus the terms of loads and threads. It is
+    symmetric where these have a potential, so that one norm serves both modes of differentiation.
 
-    def nearly(b: Imbalance) -> Imbalance:
+    **Arguments:** `apply`: product with A; of `unknown` and the result only the free strains count.
+    """
+    at = state_of(unknown, problem, kind)
+    flat, unravel_row = ravel_pytree(right)
+    _, unravel_change = ravel_pytree(_free_part(unknown, kind))
+    to_row, to_change = lax.stop_gradient(_units(problem, kind, right))
+
+    def nearly(b: ArmImbalance) -> ArmUnknown:
         step, _ = approximate_solve(unknown, at, b, problem, kind)
-        step = cast(step, problem.grid.h.dtype)
-        return Imbalance(chosen(step.xi, kind.free), step.tension, step.turning)
+        return _free_part(cast(step, problem.grid.h.dtype), kind)
 
     def scaled_apply(x: Array) -> Array:
-        return to_row * ravel_pytree(matvec(unravel(to_change * x)))[0]
+        return to_row * ravel_pytree(apply(unravel_change(to_change * x)))[0]
 
     def scaled_nearly(b: Array) -> Array:
-        return ravel_pytree(nearly(unravel(b / to_row)))[0] / to_change
+        return ravel_pytree(nearly(unravel_row(b / to_row)))[0] / to_change
 
-    # what does not depend on the right side is done once, before the loop
-    b = to_row * ravel_pytree(right)[0]
+    # all that does not depend on the right side is computed once, before the loop
+    b = to_row * flat
     _, forward = jax.linearize(scaled_nearly, jnp.zeros_like(b))
     back = jax.linear_transpose(forward, b)
 
@@ -154,23 +147,29 @@ def tangent_solve(
     def transpose_solve(apply: Callable, b: Array) -> Array:
         return _refined(apply, lambda r: back(r)[0], b)
 
-    return unravel(to_change * lax.custom_linear_solve(scaled_apply, b, solve, transpose_solve))
+    return unravel_change(
+        to_change * lax.custom_linear_solve(scaled_apply, b, solve, transpose_solve)
+    )
 
 
-def _units(problem: Problem, kind: Kind, like: Imbalance) -> tuple[Array, Array]:
-    """What makes rows of the residual, and changes of the unknowns from their scaled ones, those of
-    the scaled system."""
+def _free_part(unknown: ArmUnknown, kind: Kind) -> ArmUnknown:
+    return unknown._replace(xi=free_components(unknown.xi, kind.free))
+
+
+def _units(problem: ArmProblem, kind: Kind, like: ArmImbalance) -> tuple[Array, Array]:
+    """Factors from rows of the residual to scaled rows, and from scaled changes of the unknowns to
+    changes."""
     stiffness, weight = problem.sections.stiffness, problem.grid.weight
-    weight = jnp.maximum(weight, 1e-6 * jnp.max(weight))  # that of an empty step is 0
-    root = tuple(jnp.sqrt(weight * s) for s in chosen(stiffness, kind.free))
+    weight = jnp.maximum(weight, 1e-6 * jnp.max(weight))  # 0 at an empty step
+    root = tuple(jnp.sqrt(weight * s) for s in free_components(stiffness, kind.free))
     turn = jnp.sqrt(weight * jnp.minimum(stiffness[1], stiffness[2]))
     tension = tuple(jnp.sqrt(cable.scale) for cable in problem.cables)
-    rows = Imbalance(
+    rows = ArmImbalance(
         tuple(weight / x for x in root),
         tuple(1 / x for x in tension),
         (turn,) * len(kind.frictional),
     )
-    changes = Imbalance(tuple(1 / x for x in root), tension, (1 / turn,) * len(kind.frictional))
+    changes = ArmImbalance(tuple(1 / x for x in root), tension, (1 / turn,) * len(kind.frictional))
     row, change = (
         ravel_pytree(jax.tree.map(lambda x, y: jnp.broadcast_to(x, y.shape), tree, like))[0]
         for tree in (rows, changes)
@@ -179,12 +178,12 @@ def _units(problem: Problem, kind: Kind, like: Imbalance) -> tuple[Array, Array]
 
 
 def _refined(apply: Callable, nearly: Callable, right: Array) -> Array:
-    """Solution of a scaled system by generalised conjugate residuals with a preconditioner, each
-    step orthogonal to the last few.
+    """Solution of a scaled system by the preconditioned generalised conjugate residual method,
+    where each direction is orthogonalised against the last few.
 
-    Where an arm is soft the approximate tangent may be ten times too stiff for one of its motions.
-    Refining by the residual alone would then take hundreds of steps; the few directions kept find
-    such a motion at once. What counts as solved is decided by the residual of the result itself.
+    For a soft motion of the arm the approximate tangent may be ten times too stiff. Plain iterative
+    refinement would then take hundreds of steps; orthogonalisation finds such a motion at once. The
+    solution is accepted by its own residual.
     """
     eps, size = jnp.finfo(right.dtype).eps, jnp.linalg.norm(right)
 
@@ -199,7 +198,7 @@ def _refined(apply: Callable, nearly: Callable, right: Array) -> Array:
         x, r, P, Q, count = carry
         p = nearly(r)
         q = apply(p)
-        for _ in range(2):  # once leaves rounding behind where little is left
+        for _ in range(2):  # once is inexact where the remainder is small
             share = Q @ q
             p, q = p - share @ P, q - share @ Q
         square = q @ q

@@ -1,7 +1,7 @@
-r"""The balance of a cross-section: the kernel that every model shares.
+r"""The balance of a cross-section: the kernel of all models.
 
-At every X the rod's elastic wrench, the threads' wrench and the reaction $\Lambda$ to the loads
-beyond X are in balance,
+At every X the elastic wrench of the rod, the wrench of the threads and the reaction $\Lambda$ to
+the loads beyond X are in balance,
 
 $$r(\xi) = \Sigma (\xi - \xi^*) - B_\tau(\xi) \tau - \Lambda = 0. \qquad (21)$$
 
@@ -22,15 +22,15 @@ with $P = [-\tilde d, 1]$, is symmetric. Symbols, each a tuple of component arra
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..arm.routing import Path, thread_tangent
 from ..arm.scene import CrossSections
 from ..numerics.component import (
+    Forces,
     Matrix,
     Vector,
     add,
@@ -42,16 +42,16 @@ from ..numerics.component import (
     single,
     subtract,
 )
-from ..numerics.implicit import change_of, instantiated, no_derivative
-from ..numerics.newton import Evaluation, newton
+from ..numerics.implicit import implicit_root
+from ..numerics.newton import Evaluation, Root, newton
 
 ALL = tuple(range(6))
-"""Places of all strains."""
+"""Indices of all strains."""
 
 
 class Balance(NamedTuple):
-    """Solution of the balance: strain, whether it was reached, whether $H$ is positive definite
-    there, Newton steps."""
+    """Solution of the balance: strain, whether it is balanced, whether $H$ is positive definite,
+    and the Newton steps."""
 
     xi: Vector
     balanced: Array
@@ -72,7 +72,7 @@ def thread_wrench(t: Vector, path: Path) -> Vector:
     return (path.y * t[2] - path.z * t[1], path.z * t[0], -path.y * t[0], *t)
 
 
-def actuation_wrench(xi: Vector, sections: CrossSections, tau: Vector) -> Vector:
+def actuation_wrench(xi: Vector, sections: CrossSections, tau: Forces) -> Vector:
     """Wrench of all threads (eq. 17): $F_a = B_\\tau(\\xi) \\tau$."""
     total = tuple(jnp.zeros_like(x) for x in xi)
     for path, force in zip(sections.paths, tau, strict=True):
@@ -81,25 +81,26 @@ def actuation_wrench(xi: Vector, sections: CrossSections, tau: Vector) -> Vector
 
 
 def residual(
-    xi: Vector, sections: CrossSections, tau: Vector, reaction: Vector | None = None
+    xi: Vector, sections: CrossSections, tau: Forces, reaction: Vector | None = None
 ) -> Vector:
-    """Imbalance of a cross-section (eq. 21): $r = \\Sigma (\\xi - \\xi^*) - B_\\tau \\tau -
+    """Residual of a cross-section (eq. 21): $r = \\Sigma (\\xi - \\xi^*) - B_\\tau \\tau -
     \\Lambda$."""
     elastic = multiply(sections.stiffness, subtract(xi, sections.rest))
     r = subtract(elastic, actuation_wrench(xi, sections, tau))
     return r if reaction is None else subtract(r, reaction)
 
 
-def tangent(xi: Vector, sections: CrossSections, tau: Vector) -> Matrix:
+def tangent(xi: Vector, sections: CrossSections, tau: Forces) -> Matrix:
     """Lower triangle of the tangent stiffness (eq. 12-13): $H = \\Sigma - A$."""
     zero = jnp.zeros_like(xi[0])
     rows = [[zero] * i + [sections.stiffness[i]] for i in range(6)]
     for path, force in zip(sections.paths, tau, strict=True):
         y, z = path.y, path.z
         t, length = thread_direction(xi, path)
-        weight = force / length
+        geometric = force / length
         w = [
-            [weight * ((1.0 if i == j else 0.0) - t[i] * t[j]) for j in range(3)] for i in range(3)
+            [geometric * ((1.0 if i == j else 0.0) - t[i] * t[j]) for j in range(3)]
+            for i in range(3)
         ]
         dw = [
             [y * w[2][j] - z * w[1][j] for j in range(3)],
@@ -116,41 +117,66 @@ def tangent(xi: Vector, sections: CrossSections, tau: Vector) -> Matrix:
     return tuple(tuple(row) for row in rows)
 
 
+def force_scale(stiffness: Vector) -> Array:
+    r"""Force that makes a strain of 1, the axial stiffness $\Sigma_{44}$ [N]: the scale of all
+    convergence tests."""
+    return stiffness[3]
+
+
+def largest_force_scale(stiffness: Vector) -> Array:
+    """Largest `force_scale` of the nodes of an arm [N]."""
+    return jnp.max(force_scale(stiffness), axis=(0, 1))
+
+
 def strain_norm(wrench: Vector, stiffness: Vector) -> Array:
-    r"""Size of a wrench as a strain without unit, $\sqrt{F^T \Sigma^{-1} F / \Sigma_{44}}$: the
-    same for every scale of arm."""
-    return jnp.sqrt(
-        dot(wrench, tuple(f / s for f, s in zip(wrench, stiffness, strict=True))) / stiffness[3]
-    )
+    r"""Dimensionless size of a wrench as a strain, $\sqrt{F^T \Sigma^{-1} F / \Sigma_{44}}$."""
+    strain = tuple(f / s for f, s in zip(wrench, stiffness, strict=True))
+    return jnp.sqrt(dot(wrench, strain) / force_scale(stiffness))
 
 
-def rounding_floor(stiffness: Vector, tau: Vector) -> Array:
-    """What is left of `strain_norm` of a balanced residual in floating point: a multiple of the
-    machine's epsilon."""
-    load = sum((jnp.abs(force) for force in tau), jnp.zeros_like(stiffness[3]))
-    return 64 * jnp.finfo(stiffness[3].dtype).eps * (1 + load / stiffness[3])
+def rounding_floor(stiffness: Vector, tau: Forces) -> Array:
+    """Rounding error of `strain_norm` of a balanced residual, a multiple of the machine epsilon."""
+    scale = force_scale(stiffness)
+    load = sum((jnp.abs(force) for force in tau), jnp.zeros_like(scale))
+    return 64 * jnp.finfo(scale.dtype).eps * (1 + load / scale)
 
 
-def forces_where(sound: Array, tau: Vector) -> Vector:
-    """Thread forces where the solution is sound and none elsewhere, so that what follows stays
-    finite there."""
+def forces_where(sound: Array, tau: Forces) -> Forces:
+    """Thread forces where the solution is sound, and zero elsewhere, so that later results stay
+    finite."""
     return tuple(jnp.where(sound, force, 0.0) for force in tau)
 
 
-def chosen(vector: Vector, free: tuple[int, ...]) -> Vector:
+def without_force(tau: Forces) -> Forces:
+    """Forces of zero in place of `tau`."""
+    return tuple(jnp.zeros_like(force) for force in tau)
+
+
+def free_components(vector: Vector, free: tuple[int, ...]) -> Vector:
     """Components of the free strains."""
     return tuple(vector[i] for i in free)
 
 
-def chosen_rows(lower: Matrix, free: tuple[int, ...]) -> Matrix:
-    """Lower triangle of a symmetric matrix that belongs to the free strains."""
+def free_block(lower: Matrix, free: tuple[int, ...]) -> Matrix:
+    """Lower triangle of the block of the free strains in a symmetric matrix."""
     return tuple(tuple(lower[i][j] for j in free if j <= i) for i in free)
 
 
 def spread(vector: Vector, free: tuple[int, ...]) -> Vector:
-    """Six components from those of the free strains, zero elsewhere."""
+    """Six components from those of the free strains, zero for the locked ones."""
     return tuple(
         vector[free.index(i)] if i in free else jnp.zeros_like(vector[0]) for i in range(6)
+    )
+
+
+def completed(free_part: Vector, locked: Vector, free: tuple[int, ...]) -> Vector:
+    """Six strains from the free ones, with the others from `locked`."""
+    one = free_part[0]
+    return tuple(
+        free_part[free.index(i)]
+        if i in free
+        else jnp.broadcast_to(locked[i], one.shape).astype(one.dtype)
+        for i in range(6)
     )
 
 
@@ -163,24 +189,23 @@ def with_locked(xi: Vector, locked: Vector, free: tuple[int, ...]) -> Vector:
 
 
 def newton_step(
-    xi: Vector, sections: CrossSections, tau: Vector, reaction: Vector | None, free: tuple[int, ...]
+    xi: Vector, sections: CrossSections, tau: Forces, reaction: Vector | None, free: tuple[int, ...]
 ) -> tuple[Vector, Vector]:
-    """Residual $r$ of the free strains and the step $H^{-1} r$ to subtract, whose last is NaN where
-    $H$ is not positive definite.
+    """Residual $r$ of the free strains and the step $H^{-1} r$ to subtract, whose last component is
+    NaN where $H$ is not positive definite.
 
-    The tangent is factored in single precision, at half the cost: of a small step only its first
-    digits matter.
+    The tangent is factored in single precision at half the cost: only the first digits of a small
+    step matter.
     """
-    r = chosen(residual(xi, sections, tau, reaction), free)
-    factor = cholesky(chosen_rows(tangent(*single((xi, sections, tau))), free))
+    r = free_components(residual(xi, sections, tau, reaction), free)
+    factor = cholesky(free_block(tangent(*single((xi, sections, tau))), free))
     step = cholesky_solve(factor, single(r))
     return r, tuple(s.astype(x.dtype) for s, x in zip(step, r, strict=True))
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(3,))
 def solve_balance(
     sections: CrossSections,
-    tau: Vector,
+    tau: Forces,
     reaction: Vector | None = None,
     free: tuple[int, ...] = ALL,
     start: Vector | None = None,
@@ -190,13 +215,54 @@ def solve_balance(
     Where $H$ is not positive definite the step is $\Sigma^{-1} r$. Derivatives of any order are
     implicit, $d\xi = -H^{-1} dr$, in forward and reverse mode.
 
-    **Arguments:** component arrays of one shape; `reaction` is left out where there are no external
-    loads; `free`: places of the strains that are solved for, the others keep their rest value;
-    `start`: where to start instead: a section that is pushed under loads may have several balances,
-    and near collapse Newton's method may miss the one there is.
+    **Arguments:** component arrays of one shape.
+    - `reaction`: $\Lambda$, None without external loads.
+    - `free`: indices of the strains that are solved for; the others keep their rest value.
+    - `start`: strain to start from. A section under compression and loads may have several
+      solutions, and near collapse Newton's method from rest may miss the only one.
 
-    **Returns:** a `Balance`. `xi` is the last iterate whether or not it is balanced.
+    **Returns:** a `Balance`. `xi` is the last iterate, balanced or not.
     """
+
+    def imbalance(
+        x: Vector, sections: CrossSections, tau: Forces, reaction: Vector | None, _: Vector | None
+    ) -> Vector:
+        return free_components(
+            residual(completed(x, sections.rest, free), sections, tau, reaction), free
+        )
+
+    def linear_solve(
+        x: Vector, sections: CrossSections, tau: Forces, _: Any, __: Any, right: Vector
+    ) -> Vector:
+        lower = tangent(completed(x, sections.rest, free), sections, tau)
+        return cholesky_solve(cholesky(free_block(lower, free)), right)
+
+    def at_rest(x: Vector, sections: CrossSections, tau: Forces, *others: Vector | None) -> tuple:
+        return free_components(sections.rest, free), sections, without_force(tau), *others
+
+    root = implicit_root(
+        partial(_find_balance, free),
+        imbalance,
+        linear_solve,
+        at_rest,
+        sections,
+        tau,
+        reaction,
+        start,
+    )
+    return Balance(
+        completed(root.x, sections.rest, free), root.converged, root.definite, root.steps
+    )
+
+
+def _find_balance(
+    free: tuple[int, ...],
+    sections: CrossSections,
+    tau: Forces,
+    reaction: Vector | None,
+    start: Vector | None,
+) -> Root:
+    """The free strains of `solve_balance`."""
     stiffness = sections.stiffness
     shape = jnp.broadcast_shapes(
         *(x.shape for x in (*stiffness, *sections.rest, *tau, *(reaction or ())))
@@ -205,47 +271,18 @@ def solve_balance(
     floor = jnp.broadcast_to(rounding_floor(stiffness, tau), shape)
 
     compliance = tuple(1 / s for s in stiffness)
+    per_force = force_scale(compliance)
 
     def evaluate(xi: Vector) -> Evaluation:
         r, step = newton_step(xi, sections, tau, reaction, free)
-        elastic = multiply(chosen(compliance, free), r)
+        elastic = multiply(free_components(compliance, free), r)
         definite = ~jnp.isnan(step[-1])
         step = tuple(jnp.where(definite, x, e) for x, e in zip(step, elastic, strict=True))
-        size = jnp.sqrt(dot(step, multiply(chosen(stiffness, free), step)) * compliance[3])
-        return Evaluation(
-            spread(step, free), size, jnp.sqrt(dot(r, elastic) * compliance[3]), definite
-        )
+        size = jnp.sqrt(dot(step, multiply(free_components(stiffness, free), step)) * per_force)
+        return Evaluation(spread(step, free), size, jnp.sqrt(dot(r, elastic) * per_force), definite)
 
     first = rest if start is None else with_locked(start, rest, free)
     xi, definite, steps = newton(evaluate, first, floor)
-    imbalance = spread(chosen(residual(xi, sections, tau, reaction), free), free)
-    return Balance(xi, strain_norm(imbalance, stiffness) <= 16 * floor, definite, steps)
-
-
-@partial(solve_balance.defjvp, symbolic_zeros=True)
-def _solve_balance_jvp(
-    free: tuple[int, ...], primals: tuple, tangents: tuple
-) -> tuple[Balance, Balance]:
-    sections, tau, reaction, start = primals
-    solution = solve_balance(sections, tau, reaction, free, start)
-    # Where nothing was balanced there is no derivative: take it at rest without forces, where it is
-    # finite, so that no other lane of a batch is harmed.
-    sound = solution.balanced & solution.definite
-    xi = tuple(
-        jnp.where(sound, x, rest) for x, rest in zip(solution.xi, sections.rest, strict=True)
-    )
-
-    def imbalance(
-        sections: CrossSections, tau: Vector, reaction: Vector | None, _: Vector | None
-    ) -> Vector:
-        return residual(
-            with_locked(xi, sections.rest, free), sections, forces_where(sound, tau), reaction
-        )
-
-    change = change_of(imbalance, primals, tangents)
-    factor = cholesky(chosen_rows(tangent(xi, sections, forces_where(sound, tau)), free))
-    change = spread(scale(-1.0, cholesky_solve(factor, chosen(change, free))), free)
-    return solution, Balance(
-        with_locked(change, instantiated(tangents[0].rest, sections.rest), free),
-        *no_derivative(*solution[1:]),
-    )
+    imbalance = spread(free_components(residual(xi, sections, tau, reaction), free), free)
+    balanced = strain_norm(imbalance, stiffness) <= 16 * floor
+    return Root(free_components(xi, free), balanced, definite, steps)

@@ -1,20 +1,20 @@
 r"""The tangent of the balance of all cross-sections, solved by block elimination along the arm.
 
-In the frame of each section a change of strain $(\kappa, \upsilon)$ turns the sections beyond it,
-$\theta' = \kappa$, and so changes the reaction at a node. With $(m, n)$ the wrench there, $(\delta
-m, \delta n)$ its change and $u$ the axis,
+In the frame of each section a change of strain $(\kappa, \upsilon)$ rotates the sections beyond
+it, $\theta' = \kappa$, and changes the reaction at a node. With $(m, n)$ the wrench at the node,
+$(\delta m, \delta n)$ its change and $u$ the axis,
 
 $$H \, \delta\xi = (\delta m - \theta \times m, \ \delta n - \theta \times n) + b, \quad
 -\delta m' = (\theta \times u + \upsilon) \times n + u \times \delta n + \theta \times c, \quad
 -\delta n' = \theta \times f,$$
 
-where c and f are follower densities. Each node stands for a cell of the length w of its weight,
-with the midpoint rule in it. The linear strains meet other nodes through the rotations only, so
-they are eliminated first, for all nodes at once. From the tip to the base the wrench's change is
-then kept as an affine function of the rotation, $P \theta + p$, and each cell asks for a system of
-three rotations; from the base to the tip follow the rotations. The midpoint rule makes the tangent
-good to the order of the distance of the nodes: as a preconditioner of the exact one it takes one to
-two digits off the error at each use.
+where c and f are follower densities. Each node represents a cell whose length is its weight w,
+integrated by the midpoint rule. The linear strains depend on other nodes through the rotations
+only, so they are eliminated first, for all nodes at once. A pass from the tip to the base then
+keeps the change of the wrench as an affine function of the rotation, $P \theta + p$, and solves a
+3 x 3 system per cell; a pass from the base to the tip gives the rotations. The error of the tangent
+is of the order of the distance between nodes: as a preconditioner of the exact one it gains one to
+two digits per application.
 """
 
 from typing import NamedTuple
@@ -27,25 +27,25 @@ from jaxtyping import Array
 from ..numerics import component as c
 from ..numerics.component import Matrix, Vector
 from ..numerics.quadrature import Grid
-from .balance import chosen, chosen_rows, spread
+from .balance import free_block, free_components, spread
 from .reaction import Loading, Reaction, turned
 
 UNSTABLE_SECTION = 1_000_000
-"""Number of negative eigenvalues that stands for a section that is unstable by itself: more than
-cables can hold."""
+"""Number of negative eigenvalues reported for a section that is unstable by itself: more than
+cables can stabilise."""
 
 
-class Cell(NamedTuple):
-    r"""What the elimination knows of one node before it comes to it, in the frame of its section.
+class EliminationCell(NamedTuple):
+    r"""Coefficients of one cell that do not depend on P, in the frame of its section.
 
-    - `width` w; `turn`: rotation of the next node's section as seen from here;
+    - `width` w; `turn`: rotation of the next node's section in this frame.
     - $\kappa = $ `compliance` $\delta m$ + `by_theta` $\theta$ + `bend`, with $\delta m$ the part
-      that P makes, at the cell's middle;
-    - over the cell the moment changes by `moment` $\theta$ + `by_bend` $\kappa$ + `moment_0`;
-    - with follower loads only, else None: what the change of the force adds to the strain,
-      `by_push`, and to the moment, `stretch`; the `axis` u; `force`, the force's change over half
-      the cell with the rotation (None without follower density); `jump`, the wrench of follower
-      points at the cell's end (None without them).
+      from P at the middle of the cell.
+    - Over the cell the moment changes by `moment` $\theta$ + `by_bend` $\kappa$ + `moment_0`.
+    - With follower loads only, else None: the effect of the change of the force on the strain,
+      `by_push`, and on the moment, `stretch`; the `axis` u; `force`, the change of the force over
+      half the cell per rotation (None without follower density); `jump`, the follower wrench at the
+      end of the cell (None without follower points).
     """
 
     width: Array
@@ -63,10 +63,9 @@ class Cell(NamedTuple):
     jump: Vector | None = None
 
 
-class Linear(NamedTuple):
-    r"""The linear strains of a node once its rotations are known: `flexibility` $(\delta n$ +
-    `by_theta` $\theta$ + `right`) $-$ `by_bend` $\kappa$, with $\delta n$ the part of the force
-    that P makes."""
+class EliminatedLinear(NamedTuple):
+    r"""The eliminated linear strains of a node: `flexibility` $(\delta n$ + `by_theta` $\theta$ +
+    `right`) $-$ `by_bend` $\kappa$, with $\delta n$ the part of the force from P."""
 
     flexibility: Matrix
     by_theta: Matrix
@@ -87,15 +86,17 @@ def eliminate(
     of negative eigenvalues of the tangent: zero where it is positive definite, `UNSTABLE_SECTION`
     where a section is unstable by itself.
 
-    **Arguments:** node arrays of shape (stages, steps) and that of the arms side by side: `lower`,
-    the lower triangle of $H$; `right`, $b$, six components; `xi` and `along`, the strain where the
-    tangent is taken and its reaction; without loads $H$ alone is solved, node by node.
+    **Arguments:** node arrays of shape (stages, steps, *arms).
+    - `lower`: lower triangle of $H$.
+    - `right`: $b$, six components.
+    - `xi`, `along`: the strain where the tangent is taken, and its reaction. Without loads only $H$
+      is solved, node by node.
 
-    **Returns:** six components, zero for the locked strains. Where the tangent is not definite they
-    may be anything.
+    **Returns:** six components, zero for the locked strains; meaningless where the tangent is not
+    definite.
     """
     if along is None or loads is None or min(free) > 2:
-        x = c.cholesky_solve(c.cholesky(chosen_rows(lower, free)), chosen(right, free))
+        x = c.cholesky_solve(c.cholesky(free_block(lower, free)), free_components(right, free))
         return spread(x, free), jnp.where(
             jnp.any(jnp.isnan(x[-1]), axis=(0, 1)), UNSTABLE_SECTION, 0
         ).astype(jnp.int32)
@@ -149,11 +150,12 @@ def _cells(
     loads: Loading,
     w: Array,
     free: tuple[int, ...],
-) -> tuple[Cell, Linear, Array]:
-    """All that does not depend on P, for all nodes at once, and whether nothing is unstable yet."""
+) -> tuple[EliminationCell, EliminatedLinear, Array]:
+    """All that does not depend on P, for all nodes at once, and whether each section is stable by
+    itself."""
     half, density = 0.5 * w, loads.follower_density
     m, n, u = c.skew(wrench[:3]), c.skew(wrench[3:]), c.skew(xi[3:])
-    moment, by_force, force = c.matmul(n, u), n, None  # changes with the rotation, less what P adds
+    moment, by_force, force = c.matmul(n, u), n, None  # changes per rotation, without those from P
     if density is not None:
         force = c.scale(-half, c.skew(density[3:]))
         moment, by_force = (
@@ -184,8 +186,8 @@ def _cells(
         xi[0],
     )
     compliance, stable = _inverse(stiff, tuple(i for i in free if i < 3))
-    lever = c.scale(-w, n)  # the moment over the cell that a linear strain makes
-    cell = Cell(
+    lever = c.scale(-w, n)  # moment over the cell per linear strain
+    cell = EliminationCell(
         w,
         _turns(rotation),
         compliance,
@@ -198,14 +200,14 @@ def _cells(
     if loads.follows:
         by_push, stretch = c.scale(-1.0, c.matmul(compliance, D)), c.matmul(lever, flexibility)
         cell = cell._replace(by_push=by_push, stretch=stretch, axis=xi[3:], force=force)
-    return cell, Linear(flexibility, by_force, right[3:], by_bend), rigid & stable
+    return cell, EliminatedLinear(flexibility, by_force, right[3:], by_bend), rigid & stable
 
 
 def _inverse(matrix: Matrix, places: tuple[int, ...]) -> tuple[Matrix, Array]:
-    """Inverse of the block of a matrix of three rows at some places, zero elsewhere, and whether
-    its leading minors are positive."""
+    """Inverse of the block of a 3 x 3 matrix at given indices, zero elsewhere, and whether its
+    leading minors are positive."""
     zero = jnp.zeros_like(matrix[0][0])
-    # the cube of a thin arm's stiffness is beyond single precision
+    # the cube of the stiffness of a thin arm underflows in single precision
     scale = sum((jnp.abs(matrix[i][i]) for i in places), zero)
     matrix = tuple(tuple(x / scale for x in row) for row in matrix)
     if len(places) == 3:
@@ -229,8 +231,7 @@ def _inverse(matrix: Matrix, places: tuple[int, ...]) -> tuple[Matrix, Array]:
 
 
 def _turns(R: Matrix) -> Matrix:
-    """Rotation of the next node's section as seen from each node's; that of the last is the
-    identity."""
+    """Rotation of the next node's section in the frame of each node; the identity for the last."""
     relative = c.matmul(
         c.transpose(jax.tree.map(lambda x: x[:-1], R)), jax.tree.map(lambda x: x[1:], R)
     )
@@ -259,9 +260,9 @@ def _jumps(along: Reaction, loads: Loading, grid: Grid) -> Vector | None:
     return None if total is None else turned(c.transpose(along.rotation), total)
 
 
-def _cell(end: tuple[Matrix, Vector], cell: Cell) -> tuple[tuple[Matrix, Vector], tuple]:
-    r"""One cell from its end to its start: P and p there, and the bend as $X \theta + x$ of the
-    rotation at its start."""
+def _cell(end: tuple[Matrix, Vector], cell: EliminationCell) -> tuple[tuple[Matrix, Vector], tuple]:
+    r"""One cell, from its end to its start: P and p at the start, and the bending as $X \theta + x$
+    of the rotation at the start."""
     P, p = _seen_from_here(*end, cell)
     mean, mean_p = _carried(P, p, cell, 0.5)
     Q, q = c.matmul(cell.compliance, mean[:3]), c.matvec(cell.compliance, mean_p[:3])
@@ -298,9 +299,9 @@ def _cell(end: tuple[Matrix, Vector], cell: Cell) -> tuple[tuple[Matrix, Vector]
     return (start, start_p), (X, x, (P[3:], p[3:]), negative)
 
 
-def _seen_from_here(P: Matrix, p: Vector, cell: Cell) -> tuple[Matrix, Vector]:
-    """P and p of the next cell's start in the frame of this one's node, the follower wrench between
-    them included."""
+def _seen_from_here(P: Matrix, p: Vector, cell: EliminationCell) -> tuple[Matrix, Vector]:
+    """P and p at the start of the next cell in the frame of this node, including the follower
+    wrench between them."""
     T, like = cell.turn, p[0]
     blocks = [c.matmul(c.matmul(T, P[i : i + 3]), c.transpose(T)) for i in range(0, len(p), 3)]
     P, p = sum(blocks, ()), sum((c.matvec(T, p[i : i + 3]) for i in range(0, len(p), 3)), ())
@@ -309,9 +310,9 @@ def _seen_from_here(P: Matrix, p: Vector, cell: Cell) -> tuple[Matrix, Vector]:
     return c.keep((P, p), like)
 
 
-def _carried(P: Matrix, p: Vector, cell: Cell, part: float) -> tuple[Matrix, Vector]:
-    """The end's change of the wrench at a part of the cell before it: the change of the force has
-    an arm."""
+def _carried(P: Matrix, p: Vector, cell: EliminationCell, part: float) -> tuple[Matrix, Vector]:
+    """Change of the wrench at a fraction of the cell before its end, including the moment of the
+    change of the force."""
     if cell.axis is None:
         return P, p
     arm = c.skew(c.scale(part * cell.width, cell.axis))
@@ -320,8 +321,8 @@ def _carried(P: Matrix, p: Vector, cell: Cell, part: float) -> tuple[Matrix, Vec
 
 
 def _negative(trace: Array, minors: Array, det: Array) -> Array:
-    """Negative eigenvalues of a matrix of three rows, if all are real: three less the changes of
-    sign of its characteristic polynomial."""
+    """Number of negative eigenvalues of a 3 x 3 matrix with real ones: three minus the sign changes
+    of its characteristic polynomial."""
     first, second, third = trace > 0, minors > 0, det > 0
     changes = (first, first == second, second == third)
     return 3 - sum(

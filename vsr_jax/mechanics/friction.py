@@ -1,13 +1,13 @@
-r"""Friction of tendons: the capstan equation $\tau' = \mp \mu \varphi' \tau$ with the rate at which
-the tendon's path turns.
+r"""Friction of tendons: the capstan equation $\tau' = \mp \mu \varphi' \tau$ with the turning rate
+$\varphi'$ of the tendon's path.
 
-Where the strain jumps, as where another tendon ends or a force acts, or where the routing has a
-corner, the path has a kink of angle $\Delta\varphi$, over which the tension falls by the factor
-$e^{\mp \mu \Delta\varphi}$ as on a drum.
+Where the strain jumps, at the end of another tendon or at a point force, or where the routing has a
+corner, the path has a kink of angle $\Delta\varphi$. Over a kink the tension changes by the factor
+$e^{\mp \mu \Delta\varphi}$.
 
 The unit tangent of the path in the world frame is $R t$, so $\varphi' = |t' + k \times t|$. The
-change of the strain along the arm that it needs is that of the balance itself, $H \xi' = \Lambda' -
-\partial r / \partial X + B_\tau \tau'$: no differences are taken.
+derivative of the strain along the arm follows from the balance, $H \xi' = \Lambda' - \partial r /
+\partial X + B_\tau \tau'$, without finite differences.
 """
 
 from typing import Any, NamedTuple
@@ -19,15 +19,19 @@ from jaxtyping import Array
 from ..arm.routing import thread_tangent
 from ..arm.scene import CrossSections
 from ..numerics import component as c
-from ..numerics.component import Vector
+from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import Grid, beyond, interpolation, locate, weighted, within
-from .balance import actuation_wrench, chosen, chosen_rows, residual, spread, tangent, with_locked
+from .balance import actuation_wrench, completed, free_block, free_components, residual, tangent
 
 
 class Friction(NamedTuple):
-    r"""Friction of the tendons that have it: $\pm\mu$ of each (positive for pull), how the
-    cross-sections change along the arm, $\partial / \partial X$ at the nodes, and 1 for each step
-    that starts at a breakpoint, where paths may have kinks (None if the arm has no breakpoints)."""
+    r"""Friction of the tendons that have it.
+
+    - `coefficients`: $\pm\mu$ of each, positive for pull.
+    - `sections_rate`: $\partial / \partial X$ of the cross-sections at the nodes.
+    - `breaks`: 1 for each step that starts at a breakpoint, where paths may have kinks; None if the
+      arm has no breakpoints.
+    """
 
     coefficients: Vector
     sections_rate: CrossSections
@@ -35,8 +39,8 @@ class Friction(NamedTuple):
 
 
 def decay(turning: Array, kinks: Array | None, coefficient: Array, grid: Grid) -> Array:
-    r"""Share of the tension left at the nodes, $e^{-\mu \varphi(X)}$, from the rates $\varphi'$
-    there and the kinks before each step."""
+    r"""Remaining share of the tension at the nodes, $e^{-\mu \varphi(X)}$, from the rates
+    $\varphi'$ there and the kinks before each step."""
     angle = jnp.sum(grid.weight * turning, axis=(0, 1)) - beyond((turning,), grid)[0]
     return jnp.exp(-coefficient * (angle if kinks is None else angle + jnp.cumsum(kinks, axis=0)))
 
@@ -44,11 +48,9 @@ def decay(turning: Array, kinks: Array | None, coefficient: Array, grid: Grid) -
 def share_left(
     reach: Array | None, turning: Array, kinks: Array | None, coefficient: Array, grid: Grid
 ) -> Array:
-    """Share of a thread's force at the nodes, from where it reaches (None for everywhere), how it
-    turns there and its kinks."""
-    if reach is None:
-        return decay(turning, kinks, coefficient, grid)
-    return reach * decay(reach * turning, kinks, coefficient, grid)
+    """Share of a thread's force at the nodes, from its reach (None for the whole arm), its turning
+    rate and its kinks."""
+    return c.times(reach, decay(c.times(reach, turning), kinks, coefficient, grid))
 
 
 def decay_at(
@@ -78,8 +80,8 @@ def kinks_of(
     tangents on both sides.
 
     The tangents are those of the polynomials through the nodes of both steps, so that the angle has
-    their order. Both are seen from the same section: rotations do not jump. A thread's own ends are
-    no kinks.
+    their order. Both are in the frame of the same section, since rotations do not jump. The ends of
+    the thread itself are not kinks.
     """
     if breaks is None:
         return None
@@ -98,20 +100,20 @@ def kinks_of(
     return jnp.concatenate([jnp.zeros_like(angle[:1]), angle])
 
 
-def strain_rate(
+def balanced_strain_rate(
     xi: Vector,
-    tau: Vector,
-    tau_rate: Vector,
+    tau: Forces,
+    tau_rate: Forces,
     reaction_rate: Vector | None,
     sections: CrossSections,
     rate: CrossSections,
     free: tuple,
 ) -> Vector:
-    r"""Change of the strain along the arm, $\xi' = H^{-1} (\Lambda' - \partial r / \partial X +
-    B_\tau \tau')$, six components.
+    r"""Derivative of the balanced strain along the arm, $\xi' = H^{-1} (\Lambda' - \partial r /
+    \partial X + B_\tau \tau')$, six components.
 
-    **Arguments:** `reaction_rate`: $\Lambda'$, None without loads; `rate`: the change of `sections`
-    along the arm.
+    **Arguments:** `tau_rate`: $\tau'$; `reaction_rate`: $\Lambda'$, None without loads; `rate`: the
+    derivative of `sections` along the arm.
     """
 
     def imbalance(sections: CrossSections) -> Vector:
@@ -120,13 +122,13 @@ def strain_rate(
     change = jax.jvp(imbalance, *_alike((sections,), (rate,)))[1]
     right = c.subtract(actuation_wrench(xi, sections, tau_rate), change)
     right = right if reaction_rate is None else c.add(right, reaction_rate)
-    factor = c.cholesky(chosen_rows(tangent(xi, sections, tau), free))
-    answer = spread(c.cholesky_solve(factor, chosen(right, free)), free)
-    return with_locked(answer, rate.rest, free)
+    factor = c.cholesky(free_block(tangent(xi, sections, tau), free))
+    return completed(c.cholesky_solve(factor, free_components(right, free)), rate.rest, free)
 
 
 def _alike(values: tuple, rates: tuple) -> tuple[Any, Any]:
-    """Values and their rates in one shape: of arms side by side either may be the same for all."""
+    """Values and their rates broadcast to one shape: in a batch of arms either may be the same for
+    all."""
     leaves, tree = jax.tree.flatten(values)
     pairs = [
         jnp.broadcast_arrays(x, dx) for x, dx in zip(leaves, jax.tree.leaves(rates), strict=True)
@@ -137,7 +139,7 @@ def _alike(values: tuple, rates: tuple) -> tuple[Any, Any]:
 def turning_rate(
     xi: Vector, xi_rate: Vector, sections: CrossSections, rate: CrossSections, place: int
 ) -> Array:
-    r"""Rate at which a thread's path turns, $\varphi' = |t' + k \times t|$ [rad/m]."""
+    r"""Turning rate of a thread's path, $\varphi' = |t' + k \times t|$ [rad/m]."""
     t_c, t_c_rate = jax.jvp(
         thread_tangent, *_alike((xi, sections.paths[place]), (xi_rate, rate.paths[place]))
     )
@@ -154,8 +156,8 @@ def turning_rate(
 
 
 def reaction_rate(xi: Vector, wrench: Vector, density: Vector) -> Vector:
-    r"""Change of the reaction, $\Lambda' = -\mathrm{ad}^*_\xi \Lambda - (c, f)$, with the load's
-    density in the body frame."""
+    r"""Derivative of the reaction along the arm, $\Lambda' = -\mathrm{ad}^*_\xi \Lambda - (c, f)$,
+    with the load density in the body frame."""
     k, u, M, N = xi[:3], xi[3:], wrench[:3], wrench[3:]
     moment = c.add(c.add(c.cross(k, M), c.cross(u, N)), density[:3])
     force = c.add(c.cross(k, N), density[3:])

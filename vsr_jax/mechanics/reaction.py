@@ -1,4 +1,4 @@
-r"""The reaction $\Lambda$ to the loads: what each cross-section carries of the loads beyond it.
+r"""The reaction $\Lambda$ to the loads: the wrench on each cross-section by the loads beyond it.
 
 In the world frame, with $p' = R u$ and load densities $(c, f)$,
 
@@ -6,13 +6,15 @@ $$n(X) = \sum_{X_i > X} F_i + \int_X^L f \, ds, \quad
 m(X) = \sum_{X_i > X} M_i + \int_X^L (c + p' \times n) \, ds, \quad
 \Lambda = (R^T m, R^T n).$$
 
-Two passes along the arm: rotations from the base up, wrenches from the tip down. Every load here
-depends on the shape through rotations only, so positions are never needed. Wrenches jump at the
-ends of steps only.
+Two passes along the arm: rotations from the base to the tip, wrenches from the tip to the base. All
+loads depend on the shape through rotations only, so positions are not computed. Wrenches jump only
+at the ends of steps.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
@@ -30,12 +32,12 @@ from ..numerics.quadrature import (
     weighted,
     within,
 )
-from ..numerics.se3 import rotation_components
+from ..numerics.se3 import base_pose, rotation_components
 
 
 class FollowerPoint(NamedTuple):
-    """A wrench that follows a section: the number of steps before it, 1 at the nodes before it, and
-    its wrench there."""
+    """A wrench that follows a section: the number of steps before it, 1 at the nodes before it and
+    0 beyond, and the wrench in the body frame."""
 
     step: Array
     before: Array
@@ -43,14 +45,14 @@ class FollowerPoint(NamedTuple):
 
 
 class Loading(NamedTuple):
-    r"""The loads of a scene on a grid, node arrays of shape (stages, steps); what is absent is
-    None.
+    r"""The loads of a scene on a grid, node arrays of shape (stages, steps); None for those that
+    are absent.
 
-    - `dead`: wrench $(\sum M_i + \int c, n)$ of the world-frame loads beyond each node, known
-      beforehand; `dead_density`: $(c, f)$ in the world frame;
+    - `dead`: wrench $(\sum M_i + \int c, n)$ of the world-frame loads beyond each node, known in
+      advance; `dead_density`: $(c, f)$ in the world frame;
     - `follower_density`: $(c, f)$ in the body frame; `follower_points`: wrenches at points in the
       body frame;
-    - `base`: rotation of the base, the identity for None.
+    - `base`: pose of the base, the identity for None.
     """
 
     dead: Vector | None
@@ -61,25 +63,42 @@ class Loading(NamedTuple):
 
     @property
     def follows(self) -> bool:
-        """Whether a load turns with the arm."""
+        """Whether a load rotates with the arm."""
         return self.follower_density is not None or bool(self.follower_points)
 
     def scaled(self, share: Array) -> "Loading":
-        """A share of all loads."""
-        dead, dead_density, follower_density = (
-            None if part is None else c.scale(share, part) for part in self[:3]
-        )
+        """A fraction of all loads."""
+        return self._mapped(lambda x: share * x)
+
+    def absent(self) -> "Loading":
+        """Zero in place of all loads."""
+        return self._mapped(jnp.zeros_like)
+
+    def _mapped(self, function: Callable[[Array], Array]) -> "Loading":
+        """A function of every component of the loads."""
         points = tuple(
-            point._replace(wrench=c.scale(share, point.wrench)) for point in self.follower_points
+            point._replace(wrench=jax.tree.map(function, point.wrench))
+            for point in self.follower_points
         )
-        return Loading(dead, dead_density, follower_density, points, self.base)
+        return self._replace(
+            dead=jax.tree.map(function, self.dead),
+            dead_density=jax.tree.map(function, self.dead_density),
+            follower_density=jax.tree.map(function, self.follower_density),
+            follower_points=points,
+        )
 
 
 class Reaction(NamedTuple):
-    """Both passes: rotations at the start of each step and at the nodes, wrench $(m, n)$ in the
-    world frame and its density $(c + p' \\times n, f)$ at the nodes, the wrench $\\Lambda$ in the
-    body frame; in the world frame the axis $p'$, the wrenches that follow at points and the density
-    that follows; the density (c, f) of all loads in the body frame."""
+    r"""Results of both passes.
+
+    - `starts`, `rotation`: rotations at the start of each step and at the nodes.
+    - `world`, `density`: wrench $(m, n)$ in the world frame and its density $(c + p' \times n, f)$
+      at the nodes.
+    - `wrench`: $\Lambda$ in the body frame.
+    - `axis`, `points`, `follower`: in the world frame the axis $p'$, the follower wrenches at
+      points and the follower density.
+    - `body_density`: density (c, f) of all loads in the body frame.
+    """
 
     starts: Matrix
     rotation: Matrix
@@ -107,8 +126,7 @@ def loading(scene: Scene, grid: Grid) -> Loading | None:
         FollowerPoint(jnp.sum(grid.start < X), (grid.X < X).astype(X.dtype), wrench)
         for X, wrench in scene.point_wrenches("body")
     )
-    base = None if scene.rod.base is None else scene.rod.base[:3, :3]
-    return Loading(dead, density, scene.density(grid.X, "body"), points, base)
+    return Loading(dead, density, scene.density(grid.X, "body"), points, scene.rod.base)
 
 
 def partial_rotation(k: Vector, h: Array, sigma: Array | float) -> Vector:
@@ -116,8 +134,8 @@ def partial_rotation(k: Vector, h: Array, sigma: Array | float) -> Vector:
     strain at its nodes.
 
     The Magnus expansion of the polynomial through the nodes, $k = b_0 + b_1 \sigma + b_2 \sigma^2$,
-    to the order of the steps. The nodes need that order too: with the first commutators alone the
-    tip of an arm under loads was of order 4.5 instead of 6.
+    to the order of the steps. Rotations at the nodes need that order too: with the first
+    commutators alone the error at the tip of a loaded arm is of order 4.5 instead of 6.
     """
     stages = k[0].shape[0]
     b = [tuple(weighted(row, x) for x in k) for row in interpolation(stages)]
@@ -141,7 +159,7 @@ def rotations(k: Vector, h: Array, base: Array | None) -> tuple[Matrix, Matrix, 
     omega = step_components(
         tuple((*(x[i] for x in k), zero[i], zero[i], zero[i]) for i in range(stages)), h
     )[:3]
-    matrix = jnp.eye(3, dtype=h.dtype) if base is None else base
+    matrix = base_pose(base, h.dtype)[:3, :3]
     first = tuple(tuple(jnp.broadcast_to(x, zero[0, 0].shape) for x in row) for row in matrix)
     end, starts = lax.scan(lambda R, E: (c.matmul(R, E), R), first, rotation_components(omega))
     nodes = jnp.asarray(gauss_legendre(stages)[0], h.dtype).reshape(-1, *(1,) * h.ndim)
@@ -149,8 +167,8 @@ def rotations(k: Vector, h: Array, base: Array | None) -> tuple[Matrix, Matrix, 
 
 
 def react(xi: Vector, grid: Grid, loads: Loading) -> Reaction:
-    """Reaction at the nodes of the strain `xi`, six component arrays of shape (stages, steps) and
-    that of the arms side by side."""
+    """Reaction at the nodes for the strain `xi`, six component arrays of shape (stages, steps,
+    *arms)."""
     starts, R, end = rotations(xi[:3], grid.h, loads.base)
     zero = (jnp.zeros_like(xi[0]),) * 3
     m, n = (zero, zero) if loads.dead is None else (loads.dead[:3], loads.dead[3:])
@@ -194,9 +212,9 @@ def reaction_change(change: Vector, along: Reaction, grid: Grid, loads: Loading)
     \times c) \, ds, \quad \delta\Lambda = R^T (\delta m - \theta \times m, \delta n - \theta \times
     n),$$
 
-    where c and f are the loads that follow; those at points add $\theta \times F$ before them. All
-    arrays broadcast: many changes may stand in an axis behind the nodes, where the other arguments
-    have an axis of size 1.
+    where c and f are the follower densities; follower points add $\theta \times F$ before them. All
+    arrays broadcast: several changes can be stacked in an axis behind those of the nodes, where the
+    other arguments have size 1.
     """
     R, m, n = along.rotation, along.world[:3], along.world[3:]
     bend, whole = c.matvec(R, change[:3]), grid.weight
@@ -243,7 +261,7 @@ def react_at(xi: Vector, grid: Grid, loads: Loading, X: Array) -> Vector:
 
 
 def turned(R: Matrix, wrench: Vector) -> Vector:
-    """Moment and force of a wrench, each turned by a rotation."""
+    """Moment and force of a wrench, each rotated by R."""
     return (*c.matvec(R, wrench[:3]), *c.matvec(R, wrench[3:]))
 
 

@@ -1,22 +1,22 @@
-r"""Whether the steps along an arm are fine enough for its shape, from the strain at their nodes and
-the threads' paths alone.
+r"""Estimate of whether the steps along an arm resolve its shape, from the strain at the nodes and
+the paths of the threads.
 
-Errors of the tip are estimated, of its place as a share of the arm's length and of its angle;
-$|\cdot|$ are root mean squares along the arm with the weight $1 - 0.7 X/L$, since what is bent near
-the base moves the tip most, what is bent near the tip turns it; and s is the number of Gauss nodes
-of a step.
+The estimate is an error of the tip: of its position as a fraction of the arm's length, and of its
+angle. $|\cdot|$ is a root mean square along the arm with the weight $1 - 0.7 X/L$, since curvature
+near the base moves the tip most while curvature near the tip only rotates it; s is the number of
+Gauss nodes per step.
 
-- Quadrature. A wave of curvature with amplitude a that turns by $\psi$ in a step has there the
-  relative error of Gauss-Legendre quadrature, $\epsilon = \psi^{2s} (s!)^4 / ((2s + 1) (2s)!^3)$,
-  at most 1. The errors of N steps have phases too: together they are $1 / (N |\sin(\psi / 2)|)$ of
-  their sum, from $N^{-1/2}$ to 1. The wave is the greater of two: that through neighbouring nodes,
-  whose second and first difference are $a (1 - \cos \varphi)$ and $a \sin \varphi$; and that which
-  each thread lays, $\psi = h |d'| / |d|$, $a = |\tau d / EI|$, which no choice of nodes can hide.
-  So does the shear $|\tau d'| / (GA - \tau)$ of that wave, which grows without bound where a thread
-  that pushes takes the arm's stiffness in shear.
-- Boundary layers. A force $|N|$ that loads ask of a section bends it over a length $\sqrt{EI /
-  |N|}$: at a clamp, at a tip that carries a moment. Where that is shorter than $h / \pi$ the angle
-  $h |\delta k|$ in which the step bends is in doubt.
+- Quadrature. For a wave of curvature with amplitude a and phase $\psi$ per step the relative error
+  of Gauss-Legendre quadrature is $\epsilon = \psi^{2s} (s!)^4 / ((2s + 1) (2s)!^3)$, at most 1. The
+  errors of N steps have phases too: their total is $1 / (N |\sin(\psi / 2)|)$ of the sum of their
+  sizes, between $N^{-1/2}$ and 1. The larger of two waves counts: that through neighbouring nodes,
+  whose second and first difference are $a (1 - \cos \varphi)$ and $a \sin \varphi$, and that by the
+  path of each thread, $\psi = h |d'| / |d|$, $a = |\tau d / EI|$, which is known even where the
+  nodes alias it. The shear $|\tau d'| / (GA - \tau)$ of that wave is included; it grows without
+  bound where a pushing thread cancels the shear stiffness.
+- Boundary layers. A force $|N|$ on a section bends the arm over a length $\sqrt{EI / |N|}$ at a
+  clamp, or at a tip with a moment. Where that is shorter than $h / \pi$, the angle $h |\delta k|$
+  over the step is unresolved.
 - Magnus series. Its first neglected term where the curvature changes by $\delta k$ over a step,
   $c_s (h |k|)^{2s-1} |\delta k|$ with $c_s = 1/12, 1/720, 1/30240$ (Bernoulli numbers; the series
   diverges beyond $2 \pi$).
@@ -30,24 +30,27 @@ from jaxtyping import Array
 
 from ..arm.scene import CrossSections
 from ..numerics import component as c
-from ..numerics.component import Vector
+from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import Grid, gauss_legendre
 from ..typing import Scalar
 from .balance import residual
 
 COARSE = 0.1
-"""Estimated error of the tip, as a share of the arm's length, from which on a shape counts as
+"""Estimated error of the tip, as a fraction of the arm's length, above which a shape is
 under-resolved."""
 
-_TURNED = 0.7
-_STIFF = 1e-3
+_TAPER = 0.7
+"""Decrease of the weight from base to tip; below 1, so that the angle of the tip still counts."""
+_MIN_SHEAR = 1e-3
+"""Fraction of the shear stiffness that is kept where threads push: it bounds the shear."""
 _NEGLECTED = {1: 1 / 12, 2: 1 / 720, 3: 1 / 30240}
+"""Coefficient of the first neglected term of the Magnus series by the number of nodes per step."""
 
 
 def step_error(
-    xi: Vector, sections: CrossSections, forces: Vector, grid: Grid, *, loaded: bool
+    xi: Vector, sections: CrossSections, forces: Forces, grid: Grid, *, loaded: bool
 ) -> Scalar:
-    """Estimate of the tip's error by the steps, as a share of the arm's length.
+    """Estimate of the error of the tip by the steps, as a fraction of the arm's length.
 
     **Arguments:** strain and cross-sections at the nodes of `grid`, component arrays of shape
     (stages, steps); the force of each thread at its start; whether there are external loads.
@@ -56,12 +59,12 @@ def step_error(
     stages, length = grid.X.shape[0], jnp.sum(grid.h)
     before, here, after, gap, span = _neighbours(xi[:3])
     h = grid.h[: here[0].size]
-    weight = h * (1 - _TURNED * jnp.mean(grid.X, axis=0) / length)[: h.size]
+    lever = h * (1 - _TAPER * jnp.mean(grid.X, axis=0) / length)[: h.size]
     change = tuple((b - a) / span for a, b in zip(before, after, strict=True))
-    first = (span / 2) ** 2 * jnp.sum(weight * c.dot(change, change))
+    first = (span / 2) ** 2 * jnp.sum(lever * c.dot(change, change))
     bent = tuple(x - a - gap * d for x, a, d in zip(here, before, change, strict=True))
-    second = jnp.sum(weight * c.dot(bent, bent))
-    total = jnp.sum(weight)
+    second = jnp.sum(lever * c.dot(bent, bent))
+    total = jnp.sum(lever)
     phase = 2 * jnp.arctan2(jnp.sqrt(second), jnp.sqrt(first)) / (span / 2)
     error = _quadrature(phase, jnp.sqrt(total) * _ratio(first + second, 2 * jnp.sqrt(second)), grid)
     for wave in _threads(xi, sections, forces, grid):
@@ -73,27 +76,27 @@ def step_error(
             jnp.any(short, axis=0)[: h.size], span * h * jnp.sqrt(c.dot(change, change)), 0.0
         )
         error = jnp.maximum(error, jnp.max(angle, initial=0.0))
-    series = jnp.sum(
-        weight * (h**2 * c.dot(here, here)) ** (2 * stages - 1) * c.dot(change, change)
-    )
+    series = jnp.sum(lever * (h**2 * c.dot(here, here)) ** (2 * stages - 1) * c.dot(change, change))
     return error + _NEGLECTED[stages] * jnp.sqrt(total * series)
 
 
 def _threads(
-    xi: Vector, sections: CrossSections, forces: Vector, grid: Grid
+    xi: Vector, sections: CrossSections, forces: Forces, grid: Grid
 ) -> list[tuple[Scalar, Scalar]]:
-    """For each thread by how much its wave turns in a step, and how far it bends and shears the arm
-    in all."""
+    """For each thread the phase of its wave per step, and the total angle by which it bends and
+    shears the arm."""
     length, waves = jnp.sum(grid.h), []
-    lever = grid.weight * (1 - _TURNED * grid.X / length)
+    lever = grid.weight * (1 - _TAPER * grid.X / length)
     softest = _softest(sections)
-    hardest = jnp.max(softest)  # the square of a thin arm's stiffness is beyond single precision
+    hardest = jnp.max(
+        softest
+    )  # the square of a thin arm's stiffness underflows in single precision
     pushed = sum((jnp.maximum(force, 0.0) for force in forces), jnp.zeros_like(length)) / xi[3]
     shear = jnp.minimum(sections.stiffness[4], sections.stiffness[5])
-    shear = jnp.maximum(shear - pushed, _STIFF * shear)
+    shear = jnp.maximum(shear - pushed, _MIN_SHEAR * shear)
     for path, reach, force in zip(sections.paths, sections.reach, forces, strict=True):
         square, slope = path.y**2 + path.z**2, path.slope_y**2 + path.slope_z**2
-        inside = lever if reach is None else reach * lever
+        inside = c.times(reach, lever)
         phase = (
             jnp.sqrt(_ratio(jnp.sum(inside * slope), jnp.sum(inside * square)))
             * length
@@ -112,8 +115,8 @@ def _softest(sections: CrossSections) -> Array:
 
 
 def _neighbours(k: Vector) -> tuple[Vector, Vector, Vector, float, float]:
-    """Values at three nodes in a row for each step, as far as there are any, and how far, in steps,
-    the others are from the first."""
+    """Values at three successive nodes for each step, as far as available, and the distances of the
+    second and third from the first, in steps."""
     stages, nodes = k[0].shape[0], gauss_legendre(k[0].shape[0])[0]
     if stages == 1:
         return (
@@ -136,8 +139,8 @@ def _neighbours(k: Vector) -> tuple[Vector, Vector, Vector, float, float]:
 
 
 def _quadrature(phase: Scalar, bend: Scalar, grid: Grid) -> Scalar:
-    """Error of the steps for waves that turn by `phase` in each and bend the arm by `bend` in
-    all."""
+    """Error of the steps for a wave with `phase` per step that bends the arm by the total angle
+    `bend`."""
     stages, steps = grid.X.shape
     relative = (
         math.factorial(stages) ** 4

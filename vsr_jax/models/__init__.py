@@ -1,7 +1,6 @@
-"""Models that find an equilibrium and describe its state: strain-dependent, prescribed basis,
-continuum.
+"""Models that compute and describe an equilibrium: strain-dependent, prescribed basis, continuum.
 
-Know scenes and mechanics. Must not know what is done with the answer.
+They use scenes and mechanics, and are independent of what is done with the result.
 """
 
 from .base import Model, Nodes, Outcome, Status, SteppedModel, classify

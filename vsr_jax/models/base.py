@@ -1,4 +1,5 @@
-"""What every model of a scene offers, and what those that advance by Magnus steps share."""
+"""The interface of all models, and the common part of those that advance the pose by Magnus
+steps."""
 
 from abc import abstractmethod
 from dataclasses import replace
@@ -14,7 +15,7 @@ from ..arm.routing import Path, thread_tangent
 from ..arm.scene import CrossSections, Scene, shared
 from ..mechanics.balance import thread_direction, thread_wrench
 from ..mechanics.resolution import COARSE, step_error
-from ..numerics.component import Vector, dot
+from ..numerics.component import Forces, Vector, dot
 from ..numerics.magnus import step_components, step_poses, tip_pose
 from ..numerics.quadrature import Grid, gauss_legendre, locate, make_grid
 from ..numerics.se3 import exp_components, pose
@@ -54,39 +55,39 @@ _MESSAGES = {
 
 
 _NOTHING = 1e-4
-"""Share of its length at rest from which on a path counts as shortened to nothing."""
+"""Fraction of its rest length below which a path counts as collapsed."""
 
 
 class Nodes(NamedTuple):
     """A grid and, at its nodes, the strain, the cross-sections and the share of each thread's force
-    (None for all of it)."""
+    (None for 1)."""
 
     grid: Grid
     xi: Vector
     sections: CrossSections
     shares: tuple[Array | None, ...]
 
-    def tau(self, forces: Vector) -> Vector:
+    def tau(self, forces: Forces) -> Forces:
         """Force of each thread at the nodes."""
         return shared(forces, self.shares)
 
 
 class Outcome(NamedTuple):
-    """What a model's solve hands back: its own state (finite even where it failed), the thread
-    forces [N] at their start, a `Status` and the Newton steps."""
+    """Result of a model's solve: its own state (finite even where it failed), the thread forces [N]
+    at their start, a `Status` and the Newton steps."""
 
     state: Any
-    forces: Vector
+    forces: Forces
     status: Array
     steps: Array
 
 
 class Model(eqx.Module):
-    """A way to find and to describe the equilibrium of a scene.
+    """A method to compute and describe the equilibrium of a scene.
 
-    `balanced_everywhere` says whether the balance of the cross-section (eq. 21) holds wherever
-    `strain` is asked for, to rounding or the model's tolerances. Then derivatives and errors may be
-    taken from the balance instead of from `solve`.
+    `balanced_everywhere`: whether the balance of the cross-section (eq. 21) holds at every X where
+    `strain` is evaluated, to rounding or to the model's tolerances. Derivatives and errors can then
+    be taken from the balance instead of from `solve`.
     """
 
     balanced_everywhere: ClassVar[bool] = False
@@ -97,21 +98,21 @@ class Model(eqx.Module):
 
     @abstractmethod
     def strain(
-        self, scene: Scene, forces: Vector, state: Any, X: Float[Array, " stations"]
+        self, scene: Scene, forces: Forces, state: Any, X: Float[Array, " stations"]
     ) -> Vector:
         r"""Strain $\xi$ at abscissas X, six component arrays."""
 
     @abstractmethod
-    def tip(self, scene: Scene, forces: Vector, state: Any) -> Pose:
+    def tip(self, scene: Scene, forces: Forces, state: Any) -> Pose:
         """Pose of the arm's end."""
 
     @abstractmethod
     def poses(
-        self, scene: Scene, forces: Vector, state: Any, X: Float[Array, " stations"]
+        self, scene: Scene, forces: Forces, state: Any, X: Float[Array, " stations"]
     ) -> Float[Array, "stations 4 4"]:
         """Poses at abscissas X."""
 
-    def coordinates(self, scene: Scene, forces: Vector, state: Any) -> Float[Array, " dofs"]:
+    def coordinates(self, scene: Scene, forces: Forces, state: Any) -> Float[Array, " dofs"]:
         """Coordinates of the strain in the model's basis."""
         raise ValueError(
             f"q: got a solution by {type(self).__name__}, need one by StrainDependent or Prescribed"
@@ -122,17 +123,17 @@ class Model(eqx.Module):
         return None
 
     @abstractmethod
-    def nodes(self, scene: Scene, forces: Vector, state: Any) -> Nodes:
-        """What quantities along the arm are summed from."""
+    def nodes(self, scene: Scene, forces: Forces, state: Any) -> Nodes:
+        """Nodes from which integrals along the arm are computed."""
 
     @abstractmethod
     def finer(self) -> "Model":
-        """The same model with twice the steps, or with tighter tolerances where they are chosen by
-        those."""
+        """The same model with twice the steps, or with tighter tolerances if the steps are
+        adaptive."""
 
-    def step_error(self, scene: Scene, forces: Vector, state: Any) -> Scalar | None:
-        """Rough estimate of the tip's error by the steps, as a share of the arm's length; None for
-        steps that adapt themselves."""
+    def step_error(self, scene: Scene, forces: Forces, state: Any) -> Scalar | None:
+        """Rough estimate of the tip's error by the steps, as a fraction of the arm's length; None
+        for adaptive steps."""
         return None
 
 
@@ -143,24 +144,24 @@ class SteppedModel(Model):
     order: eqx.AbstractVar[int]
 
     def breakpoints(self, scene: Scene) -> tuple[Array, ...]:
-        """Abscissas [m] where steps break besides those of the scene."""
+        """Abscissas [m] where steps must end, besides those of the scene."""
         return ()
 
     def grid(self, scene: Scene) -> Grid:
         """Steps along the arm and their nodes."""
         return make_grid(scene.edges(self.breakpoints(scene)), self.steps, self.order // 2)
 
-    def tip(self, scene: Scene, forces: Vector, state: Any) -> Pose:
+    def tip(self, scene: Scene, forces: Forces, state: Any) -> Pose:
         return tip_pose(self.node_strain(scene, state), self.grid(scene).h, scene.rod.base)
 
     def finer(self) -> "SteppedModel":
         return replace(self, steps=2 * self.steps)
 
-    def step_error(self, scene: Scene, forces: Vector, state: Any) -> Scalar:
+    def step_error(self, scene: Scene, forces: Forces, state: Any) -> Scalar:
         nodes = self.nodes(scene, forces, state)
         sections = nodes.sections._replace(
             reach=nodes.shares
-        )  # friction takes of a thread's force, no load does
+        )  # friction reduces a thread's force, loads do not
         return step_error(nodes.xi, sections, forces, nodes.grid, loaded=bool(scene.loads))
 
     @abstractmethod
@@ -168,7 +169,7 @@ class SteppedModel(Model):
         """Strain at the nodes of `grid`, six component arrays of shape (stages, steps)."""
 
     def poses(
-        self, scene: Scene, forces: Vector, state: Any, X: Float[Array, " stations"]
+        self, scene: Scene, forces: Forces, state: Any, X: Float[Array, " stations"]
     ) -> Float[Array, "stations 4 4"]:
         grid = self.grid(scene)
         ends = step_poses(self.node_strain(scene, state), grid.h, scene.rod.base)
@@ -184,8 +185,8 @@ class SteppedModel(Model):
 
 
 def resolved(model: Model, scene: Scene, outcome: Outcome) -> Outcome:
-    """The outcome, with the status under-resolved where it had converged on steps that are too few
-    for its shape."""
+    """The outcome, with the status under-resolved where it converged on too few steps for its
+    shape."""
     error = model.step_error(scene, outcome.forces, outcome.state)
     if error is None:
         return outcome
@@ -198,20 +199,20 @@ def resolved(model: Model, scene: Scene, outcome: Outcome) -> Outcome:
 def classify(
     xi: Vector,
     sections: CrossSections,
-    tau: Vector,
+    tau: Forces,
     balanced: Array,
     definite: Array,
     *,
     loaded: bool = False,
 ) -> Array:
-    """`Status` from the strain, whether it balances and whether the tangent is positive definite,
-    over all nodes.
+    """`Status` from the strain, whether it is balanced and whether the tangent is positive
+    definite, over all nodes.
 
-    With tendons alone (not `loaded`) the energy is convex, so a node that cannot be balanced has
-    its least energy at a kink, where the path of a thread has no length left: it has collapsed. So
-    has a node where a path, or the axis, is shortened to less than a ten-thousandth or has turned
-    over, and under loads, where it cannot be balanced, one with a thread that alone would shorten
-    its path to nothing.
+    With tendons alone (not `loaded`) the energy is convex. A node that cannot be balanced then has
+    its minimum of energy at a kink of the energy, where the path of a thread has length zero: it is
+    collapsed. So is a node where a path or the axis is shortened to less than 1e-4 of its rest
+    length or is reversed. Under loads a node that cannot be balanced is collapsed if one thread
+    alone would shorten its path to zero.
     """
     pulling = jnp.array(False)
     if tau and loaded:
@@ -240,7 +241,7 @@ def classify(
 
 
 def _exhausted(force: Array, path: Path, sections: CrossSections) -> Array:
-    r"""Whether a tendon alone would use up its path at the rate by which it shortens at rest: $T
+    r"""Whether a tendon alone would shorten its path to zero, extrapolated from the rest state: $T
     w^T \Sigma^{-1} w \ge |t_c|$."""
     t, length = thread_direction(sections.rest, path)
     w = thread_wrench(t, path)
@@ -250,7 +251,7 @@ def _exhausted(force: Array, path: Path, sections: CrossSections) -> Array:
 
 
 def rest_where_failed(status: Array, xi: Vector, sections: CrossSections) -> Vector:
-    """`xi`, replaced by the rest strain where the solve failed, so that what follows stays
+    """`xi`, replaced by the rest strain where the solve failed, so that later results stay
     finite."""
     return tuple(
         jnp.where(status == Status.CONVERGED, x, rest)

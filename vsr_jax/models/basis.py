@@ -1,8 +1,7 @@
 r"""Strain bases: $\xi(X) = B_q(X) q + \xi^*(X)$ (eq. 14), $B_q$ of shape (6, n).
 
-A `Basis` gives each strain a `Family` of scalar functions of $s = X / L$ or of X; a strain without
-one is switched off and keeps its rest value. `FunctionBasis` takes the whole matrix as a function
-of X.
+A `Basis` assigns to each strain a `Family` of scalar functions of $s = X / L$ or of X; a strain
+without one is locked at its rest value. `FunctionBasis` is the whole matrix as a function of X.
 """
 
 from abc import abstractmethod
@@ -26,14 +25,14 @@ class Family(eqx.Module):
     @property
     @abstractmethod
     def size(self) -> int:
-        """How many functions there are."""
+        """Number of functions."""
 
     @abstractmethod
     def __call__(self, X: Scalar, length: Scalar) -> Float[Array, " size"]:
         """Their values at X [m] on an arm of `length` [m]."""
 
     def breakpoints(self, length: Scalar) -> tuple[Scalar, ...]:
-        """Abscissas [m] where a function or a derivative of it jumps."""
+        """Abscissas [m] where a function or its derivative jumps."""
         return ()
 
 
@@ -58,8 +57,8 @@ class Monomial(Family):
 
 
 class Legendre(Family):
-    """Legendre polynomials $P_0, \\dots, P_{order}$ of $2 X / L - 1$: orthogonal on the arm, well
-    conditioned at any order."""
+    """Legendre polynomials $P_0, \\dots, P_{order}$ of $2 X / L - 1$: orthogonal on the arm, and
+    well conditioned at every order."""
 
     order: int = eqx.field(static=True)
 
@@ -79,8 +78,8 @@ class Legendre(Family):
 
 
 class Trigonometric(Family):
-    """$1, \\sin \\omega_i X, \\cos \\omega_i X$ for given angular frequencies; each group by
-    choice.
+    """$1, \\sin \\omega_i X, \\cos \\omega_i X$ for given angular frequencies; each
+    group is optional.
 
     **Arguments:**
     - `frequencies`: $\\omega_i$ [rad/m], a number or several.
@@ -119,8 +118,8 @@ class PiecewiseConstant(Family):
     """Indicators of sections of the arm (PCS): one constant strain in each.
 
     **Arguments:**
-    - `sections`: how many sections of equal length, or the inner ends of the sections as fractions
-      of the length, rising.
+    - `sections`: number of sections of equal length, or the inner ends of the sections as ascending
+      fractions of the length.
     """
 
     ends: Float[Array, " inner"]
@@ -134,8 +133,8 @@ class PiecewiseConstant(Family):
             known is not None and not np.all(np.diff(known, prepend=0.0, append=1.0) > 0)
         ):
             raise ValueError(
-                f"PiecewiseConstant.sections: got {sections!r}, need an integer, or rising "
-                f"fractions between 0 and 1"
+                f"PiecewiseConstant.sections: got {sections!r}, need an integer, or "
+                f"ascending fractions between 0 and 1"
             )
 
     @property
@@ -183,11 +182,11 @@ class AbstractBasis(eqx.Module):
 
     @property
     def strains(self) -> tuple[str, ...]:
-        """Names of the strains it frees."""
+        """Names of the strains that it frees."""
         return STRAINS
 
     def breakpoints(self, length: Scalar) -> tuple[Scalar, ...]:
-        """Abscissas [m] where the basis or a derivative of it jumps."""
+        """Abscissas [m] where the basis or its derivative jumps."""
         return ()
 
 
@@ -195,7 +194,7 @@ class Basis(AbstractBasis):
     """Each strain with its own family; coordinates are ordered strain by strain.
 
     **Arguments:** `families`: maps strain names (torsion, bending_y, bending_z, elongation,
-    shear_y, shear_z) to families. Strains that are not named are switched off.
+    shear_y, shear_z) to families. Strains that are not named are locked at their rest value.
 
     **Raises:** `ValueError` for an unknown strain name or for no strain at all.
     """

@@ -23,24 +23,24 @@ from ..mechanics.balance import (
 )
 from ..mechanics.reaction import loading, react_at
 from ..numerics import component as c
-from ..numerics.component import Vector
+from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import locate, make_grid
 from ..numerics.se3 import coad, hat, inverse
 from ..typing import Pose, Scalar, Twist
 from ..validation import count, instance, positive
 from .base import Model, Nodes, Outcome, Status, classify
-from .shooting import Control, Guess, Line, Shot, Unknown, integrate, shoot
+from .shooting import Control, Guess, Line, ShootingUnknown, Shot, integrate, shoot
 from .strain_dependent import StrainDependent
 
 
 class Found(NamedTuple):
-    """What is kept of a solution: the tip's pose relative to the base, and the inputs."""
+    """State of the continuous model: the pose of the tip relative to the base, and the inputs."""
 
     tip: Pose
     inputs: Array
 
 
-def strain_rate(scene: Scene, tau: Vector, xi: Twist, X: Scalar) -> Twist:
+def cosserat_strain_rate(scene: Scene, tau: Forces, xi: Twist, X: Scalar) -> Twist:
     r"""Right side of eq. (12): $\xi' = (\Sigma - A)^{-1} (a - b - c)$.
 
     With $r = F_i - F_a$ the balance (8) is $r' + \mathrm{ad}^*_\xi r = 0$, and $r' = H \xi' +
@@ -64,18 +64,17 @@ class Continuum(Model):
     problem (see `shooting`).
 
     Derivatives are implicit. The solution of eq. (8) satisfies the balance (21) at every X, so its
-    exact derivative is that of the balance, which `derivative`, a `StrainDependent` model, carries
-    to the poses; the adaptive integration is never unrolled.
+    exact derivative is that of the balance, computed by `derivative`, a `StrainDependent` model;
+    the adaptive integration is never differentiated.
 
     **Arguments:**
     - `solver`: a diffrax solver, `diffrax.Dopri8()` by default.
-    - `rtol`, `atol`: tolerances of the step size control, at least four times the machine's
-      epsilon.
+    - `rtol`, `atol`: tolerances of the step size control, at least four times the machine epsilon.
     - `max_steps`: bound on the number of steps.
-    - `segments`: of the multiple shooting, for arms with loads, jumps, given thread lengths or
-      friction.
-    - `derivative`: the steps on which derivatives are computed. Where there is shooting they give
-      the first guess as well, and the tensions that thread lengths and friction call for.
+    - `segments`: segments of the multiple shooting, for arms with loads, jumps, prescribed thread
+      lengths or friction.
+    - `derivative`: the model that computes derivatives. For shooting it also gives the initial
+      guess, and the tensions by thread lengths and friction.
     """
 
     solver: diffrax.AbstractSolver = eqx.field(static=True)
@@ -113,19 +112,19 @@ class Continuum(Model):
         return Outcome(Found(tip, inputs), forces, status, steps)
 
     def strain(
-        self, scene: Scene, forces: Vector, state: Found, X: Float[Array, " stations"]
+        self, scene: Scene, forces: Forces, state: Found, X: Float[Array, " stations"]
     ) -> Vector:
         return c.split(_line(self, scene, state.inputs, X).xi)
 
-    def tip(self, scene: Scene, forces: Vector, state: Found) -> Pose:
+    def tip(self, scene: Scene, forces: Forces, state: Found) -> Pose:
         return _from_base(scene, state.tip)
 
     def poses(
-        self, scene: Scene, forces: Vector, state: Found, X: Float[Array, " stations"]
+        self, scene: Scene, forces: Forces, state: Found, X: Float[Array, " stations"]
     ) -> Float[Array, "stations 4 4"]:
         return _from_base(scene, _line(self, scene, state.inputs, X).g)
 
-    def nodes(self, scene: Scene, forces: Vector, state: Found) -> Nodes:
+    def nodes(self, scene: Scene, forces: Forces, state: Found) -> Nodes:
         grid = self.derivative.grid(scene)
         xi = tuple(
             x.reshape(grid.X.shape) for x in self.strain(scene, forces, state, grid.X.reshape(-1))
@@ -154,7 +153,7 @@ def _from_base(scene: Scene, g: Array) -> Array:
 
 
 def _initial_value(scene: Scene) -> bool:
-    """Whether the arm can be integrated in one go: no loads, nothing that jumps, all strains
+    """Whether the arm is a single initial value problem: no coupling, no jumps, all strains
     free."""
     return not scene.coupled and not scene.breakpoints and scene.free == ALL
 
@@ -172,7 +171,7 @@ def _tip(model: Continuum, scene: Scene, inputs: Array) -> tuple[Pose, Vector, A
     line = jax.tree.map(lambda y: y[0], ys)
     tau, sections = scene.forces(inputs), scene.sections(jnp.zeros_like(scene.rod.length))
     imbalance = strain_norm(residual(c.split(line.xi), sections, tau), sections.stiffness)
-    # Where the path branched or jumped the integration carries on but loses the balance.
+    # Past a jump or a bifurcation the integration continues but is no longer balanced.
     balanced = (
         imbalance
         <= rounding_floor(sections.stiffness, tau) + 100 * (model.rtol + model.atol) ** 0.5
@@ -218,7 +217,7 @@ def _line_jvp(primals: tuple, tangents: tuple) -> tuple[Line, Line]:
 
 
 def _relative(scene: Scene, g: Array) -> Array:
-    """Poses relative to the base from poses in a world frame at the base's place."""
+    """Poses relative to the base, from poses with the base's origin but the world's axes."""
     if scene.rod.base is None:
         return g
     turn = jnp.eye(4, dtype=g.dtype).at[:3, :3].set(scene.rod.base[:3, :3].T)
@@ -226,7 +225,7 @@ def _relative(scene: Scene, g: Array) -> Array:
 
 
 def _shoot(model: Continuum, scene: Scene, inputs: Array) -> tuple[Shot, Guess, Array]:
-    """Multiple shooting from the solution on the steps of `derivative`, and the status."""
+    """Multiple shooting from the solution of `derivative`, and the status."""
     steps = model.derivative
     found = steps.solve(scene, inputs)
     grid, segments = steps.grid(scene), make_grid(scene.edges(), model.segments, 1)
@@ -234,7 +233,7 @@ def _shoot(model: Continuum, scene: Scene, inputs: Array) -> tuple[Shot, Guess, 
     loads = loading(scene, grid)
     zero = jnp.zeros_like(segments.start)
     wrench = (zero,) * 6 if loads is None else react_at(found.state.xi, grid, loads, segments.start)
-    first = Unknown(
+    first = ShootingUnknown(
         steps.poses(scene, found.forces, found.state, segments.start)[:, :3, :3], c.join(wrench)
     )
     control = model._control(grid.h.dtype)
@@ -272,8 +271,8 @@ def _at_origin(scene: Scene) -> Scene:
 def _integrate(
     model: Continuum, scene: Scene, inputs: Array, saveat: diffrax.SaveAt
 ) -> tuple[Line, Array, Array]:
-    """Strain and pose relative to the tip where `saveat` says, the status and the number of
-    steps."""
+    """Strain and pose relative to the tip at the abscissas of `saveat`, the status and the number
+    of steps."""
     tau, length = scene.forces(inputs), scene.rod.length
     sections = scene.sections(length)
     end = solve_balance(sections, tau)
@@ -283,7 +282,7 @@ def _integrate(
     tau = forces_where(sound, tau)
 
     def field(x: Any, line: Line, _: None) -> Line:
-        return Line(strain_rate(scene, tau, line.xi, x), line.g @ hat(line.xi))
+        return Line(cosserat_strain_rate(scene, tau, line.xi, x), line.g @ hat(line.xi))
 
     control = model._control(xi.dtype)
     solution = diffrax.diffeqsolve(

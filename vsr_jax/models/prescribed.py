@@ -1,7 +1,6 @@
 r"""The model with a prescribed basis (eq. 14-18): $K q = B(q) \tau$ by Gauss quadrature and
 Newton's method."""
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,18 +11,20 @@ from jaxtyping import Array, Float
 from ..arm.scene import CrossSections, Scene
 from ..mechanics.arm_balance import problem_of, with_tensions
 from ..mechanics.balance import (
+    force_scale,
     forces_where,
     residual,
     rounding_floor,
     tangent,
     thread_direction,
     thread_wrench,
+    without_force,
 )
 from ..numerics import component as c, lu
-from ..numerics.component import Vector
-from ..numerics.implicit import change_of, no_derivative
+from ..numerics.component import Forces, Vector
+from ..numerics.implicit import implicit_root
 from ..numerics.magnus import ORDERS, accumulate_jacobian
-from ..numerics.newton import Evaluation, newton
+from ..numerics.newton import Evaluation, Root, newton
 from ..numerics.quadrature import Grid, make_grid, onto
 from ..typing import Scalar
 from ..validation import ROUNDING, choice, count, instance, on_arm
@@ -34,8 +35,8 @@ from .prescribed_loaded import solve_prescribed
 
 
 class Projection(NamedTuple):
-    """A basis and the cross-sections at the quadrature points: `weight` [m] of each, `matrix` $B_q$
-    (points, 6, n)."""
+    """A basis and the cross-sections at the quadrature points, with the quadrature `weight` [m] and
+    the `matrix` $B_q$, shape (points, 6, n)."""
 
     sections: CrossSections
     weight: Float[Array, " points"]
@@ -50,8 +51,7 @@ class Projection(NamedTuple):
         return jnp.einsum("x,xia,xi->a", self.weight, self.matrix, c.join(wrench))
 
     def stiffness(self, lower: c.Matrix) -> Float[Array, "dofs dofs"]:
-        """Generalised stiffness $\\int B_q^T H B_q \\, dX$ of a symmetric $H$ given by its lower
-        triangle."""
+        """Generalised stiffness $\\int B_q^T H B_q \\, dX$ from the lower triangle of $H$."""
         weighted = self.weight[:, None, None] * (c.join_matrix(c.symmetric(lower)) @ self.matrix)
         return jnp.einsum("xia,xib->ab", self.matrix, weighted)
 
@@ -70,61 +70,47 @@ def project(scene: Scene, basis: AbstractBasis, points: int) -> Projection:
     return Projection(scene.sections(X), grid.weight.reshape(-1), matrix)
 
 
-@jax.custom_jvp
-def solve_projected(
-    projection: Projection, tau: Vector
-) -> tuple[Float[Array, " dofs"], Array, Array, Array]:
+def solve_projected(projection: Projection, tau: Forces) -> Root:
     r"""Coordinates q with $K q = B(q) \tau$ (eq. 18), by Newton's method on the symmetric tangent
-    $K - \partial (B \tau) / \partial q$.
+    $K - \partial (B \tau) / \partial q$. Derivatives of any order are implicit."""
 
-    **Returns:** q, whether the residual is balanced, whether the tangent is positive definite, and
-    the Newton steps. Derivatives of any order are implicit.
-    """
+    def linear_solve(q: Array, projection: Projection, tau: Forces, right: Array) -> Array:
+        return lu.solve(_tangent(q, projection, tau), right)
+
+    def at_rest(q: Array, projection: Projection, tau: Forces) -> tuple:
+        return jnp.zeros_like(q), projection, without_force(tau)
+
+    return implicit_root(_find_projected, _imbalance, linear_solve, at_rest, projection, tau)
+
+
+def _imbalance(q: Array, projection: Projection, tau: Forces) -> Array:
+    """$K q - B(q) \\tau$."""
+    return projection.integrate(residual(projection.strain(q), projection.sections, tau))
+
+
+def _tangent(q: Array, projection: Projection, tau: Forces) -> Array:
+    return projection.stiffness(tangent(projection.strain(q), projection.sections, tau))
+
+
+def _find_projected(projection: Projection, tau: Forces) -> Root:
     K = projection.elastic_stiffness()
     elastic = lu.factor(K)
-    axial = jnp.sum(projection.weight * projection.sections.stiffness[3])
+    axial = jnp.sum(projection.weight * force_scale(projection.sections.stiffness))
 
     def norm(force: Array, change: Array) -> Array:
         return jnp.sqrt(jnp.maximum(force @ change, 0.0) / axial)
 
-    def imbalance(q: Array) -> Array:
-        return projection.integrate(residual(projection.strain(q), projection.sections, tau))
-
     def evaluate(q: Array) -> Evaluation:
-        r = imbalance(q)
-        factors = lu.factor(
-            projection.stiffness(tangent(projection.strain(q), projection.sections, tau))
-        )
+        r = _imbalance(q, projection, tau)
+        factors = lu.factor(_tangent(q, projection, tau))
         definite, relaxed = jnp.all(lu.diagonal(factors) > 0), lu.substitute(elastic, r)
         step = jnp.where(definite, lu.substitute(factors, r), relaxed)
         return Evaluation(step, norm(K @ step, step), norm(r, relaxed), definite)
 
     floor = jnp.max(rounding_floor(projection.sections.stiffness, tau)) * K.shape[0] ** 0.5
     q, definite, steps = newton(evaluate, jnp.zeros(K.shape[0], K.dtype), floor)
-    left = imbalance(q)
-    return q, norm(left, lu.substitute(elastic, left)) <= 16 * floor, definite, steps
-
-
-@partial(solve_projected.defjvp, symbolic_zeros=True)
-def _solve_projected_jvp(primals: tuple, tangents: tuple) -> tuple:
-    projection, tau = primals
-    q, balanced, definite, steps = solve_projected(projection, tau)
-    sound = balanced & definite
-    q_sound = jnp.where(sound, q, 0.0)
-
-    def imbalance(projection: Projection, tau: Vector) -> Array:
-        return projection.integrate(
-            residual(projection.strain(q_sound), projection.sections, forces_where(sound, tau))
-        )
-
-    change = change_of(imbalance, primals, tangents)
-    H = projection.stiffness(
-        tangent(projection.strain(q_sound), projection.sections, forces_where(sound, tau))
-    )
-    return (q, balanced, definite, steps), (
-        -lu.solve(H, change),
-        *no_derivative(balanced, definite, steps),
-    )
+    left = _imbalance(q, projection, tau)
+    return Root(q, norm(left, lu.substitute(elastic, left)) <= 16 * floor, definite, steps)
 
 
 class Prescribed(SteppedModel):
@@ -133,10 +119,10 @@ class Prescribed(SteppedModel):
     **Arguments:**
     - `basis`: an `AbstractBasis`, such as `Basis.uniform(Legendre(4))`.
     - `points`: Gauss points of the quadrature of $K$ and $B(q)$ on each smooth piece of the arm.
-      With loads, given thread lengths or friction the quadrature is that of the pose steps instead.
+      With loads, prescribed thread lengths or friction the quadrature is that of the pose steps.
     - `steps`, `order`: pose steps as for `StrainDependent`.
 
-    **Raises:** `ValueError` on solving a scene that locks a strain the basis frees.
+    **Raises:** `ValueError` on solving a scene that locks a strain which the basis frees.
     """
 
     basis: AbstractBasis
@@ -176,7 +162,7 @@ class Prescribed(SteppedModel):
         sound = status == Status.CONVERGED
         return Outcome(jnp.where(sound, q, 0.0), forces_where(sound, forces), status, steps)
 
-    def _at_nodes(self, scene: Scene, grid: Grid) -> prescribed_loaded.Basis:
+    def _at_nodes(self, scene: Scene, grid: Grid) -> prescribed_loaded.NodalBasis:
         X = grid.X.reshape(-1)
 
         def at(x: Scalar) -> Array:
@@ -187,7 +173,7 @@ class Prescribed(SteppedModel):
 
         matrix, rate = jax.vmap(with_rate)(X) if scene.frictional else (jax.vmap(at)(X), None)
         shape = (*grid.X.shape, 6, self.basis.size)
-        return prescribed_loaded.Basis(
+        return prescribed_loaded.NodalBasis(
             matrix.reshape(shape), None if rate is None else rate.reshape(shape)
         )
 
@@ -200,7 +186,7 @@ class Prescribed(SteppedModel):
                 f"{', '.join(scene.free_strains)}, as the scene"
             )
 
-    def coordinates(self, scene: Scene, forces: Vector, state: Array) -> Float[Array, " dofs"]:
+    def coordinates(self, scene: Scene, forces: Forces, state: Array) -> Float[Array, " dofs"]:
         return state
 
     def dofs(self, scene: Scene) -> int:
@@ -210,7 +196,7 @@ class Prescribed(SteppedModel):
         X = self.grid(scene).X
         return tuple(x.reshape(X.shape) for x in self._strain(scene, state, X.reshape(-1)))
 
-    def nodes(self, scene: Scene, forces: Vector, state: Array) -> Nodes:
+    def nodes(self, scene: Scene, forces: Forces, state: Array) -> Nodes:
         grid = self.grid(scene)
         xi, sections = self.node_strain(scene, state), scene.sections(grid.X)
         if not scene.frictional:
@@ -224,7 +210,7 @@ class Prescribed(SteppedModel):
         )
 
     def strain(
-        self, scene: Scene, forces: Vector, state: Array, X: Float[Array, " stations"]
+        self, scene: Scene, forces: Forces, state: Array, X: Float[Array, " stations"]
     ) -> Vector:
         return self._strain(scene, state, X)
 
@@ -284,8 +270,8 @@ def jacobian(
     r"""Geometric Jacobian (eq. 15): $J(q, X) = \mathrm{Ad}_g^{-1} \int_0^X \mathrm{Ad}_g B_q \,
     ds$.
 
-    The body twist of the section at X is $\eta = J \dot q$. It is the exact derivative of the pose
-    steps, hence of their order.
+    The body twist of the section at X is $\eta = J \dot q$. J is the exact derivative of the pose
+    steps and has their order.
 
     **Arguments:**
     - `q`: coordinates, shape (n,).

@@ -1,11 +1,11 @@
-r"""The loaded model in a prescribed basis: $K q = B(q) \tau + \int B_q^T \Lambda \, dX$, with given
-thread lengths and friction.
+r"""The Galerkin balance in a prescribed basis: $K q = B(q) \tau + \int B_q^T \Lambda \, dX$, with
+prescribed thread lengths and friction.
 
-The load term is the virtual work of the loads, integrated by parts: one pass of rotations up the
-arm and one of wrenches down it (see `reaction`), no assembled Jacobian. Unknown are the coordinates
-and the tension of each tendon driven by its length. Newton's tangent is that of the integrals,
-$\int B_q^T (H B_q - \delta\Lambda) dX$, for all coordinates at once and in single precision;
-derivatives of the solution take the exact one of the steps, by forward differentiation.
+The load term is the virtual work of the loads, integrated by parts: one pass of rotations to the
+tip and one of wrenches to the base (see `reaction`), without assembling a Jacobian. The unknowns
+are the coordinates and the tension of each tendon with prescribed length. Newton's method uses the
+tangent $\int B_q^T (H B_q - \delta\Lambda) dX$ in single precision; derivatives of the solution use
+the exact tangent of the discrete residual, by forward differentiation.
 """
 
 from functools import partial
@@ -16,46 +16,52 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..arm.scene import shared
-from ..mechanics.arm_balance import Kind, Problem, harmless, pull_of, rounding_of, with_tensions
-from ..mechanics.balance import residual, tangent, thread_direction, thread_wrench
+from ..mechanics.arm_balance import ArmProblem, Kind, pull_of, rounding_of, with_tensions
+from ..mechanics.balance import (
+    largest_force_scale,
+    residual,
+    tangent,
+    thread_direction,
+    thread_wrench,
+)
 from ..mechanics.cable import path_length
 from ..mechanics.friction import kinks_of, share_left, turning_rate
 from ..mechanics.reaction import Reaction, react, reaction_change
 from ..numerics import component as c, lu
 from ..numerics.batching import arms_in, side_by_side
-from ..numerics.component import Vector
-from ..numerics.implicit import change_of, no_derivative
-from ..numerics.newton import LOAD_SHARES, MOST_TURN, Damped, Solution, damped_newton
+from ..numerics.component import Forces, Vector
+from ..numerics.implicit import implicit_root
+from ..numerics.newton import LOAD_INCREMENTS, MAX_TURN, Damped, Root, damped_newton
 from ..numerics.quadrature import Grid
 
 
-class Unknown(NamedTuple):
+class GalerkinUnknown(NamedTuple):
     """Coordinates, and tension [N] of each cable."""
 
     q: Float[Array, "dofs *arms"]
     tension: Float[Array, "cables *arms"]
 
 
-class Basis(NamedTuple):
-    r"""The basis at the nodes, $B_q$, shape (stages, steps, 6, n), and its change along the arm
+class NodalBasis(NamedTuple):
+    r"""The basis at the nodes, $B_q$, shape (stages, steps, 6, n), and its derivative along the arm
     (None without friction)."""
 
     matrix: Array
     rate: Array | None
 
 
-class At(NamedTuple):
-    """What follows from the unknowns: strain at the nodes, share of each thread's force there, its
-    force, the reaction, and the slack of each cable [m]."""
+class GalerkinState(NamedTuple):
+    """Quantities computed from the unknowns: strain at the nodes, share of each thread's force
+    there, its force, the reaction, and the slack of each cable [m]."""
 
     xi: Vector
     shares: tuple[Array | None, ...]
-    tau: Vector
+    tau: Forces
     along: Reaction | None
     slack: Vector
 
 
-def strain(q: Array, basis: Basis, problem: Problem) -> Vector:
+def strain(q: Array, basis: NodalBasis, problem: ArmProblem) -> Vector:
     r"""Strain at the nodes, $\xi = B_q q + \xi^*$."""
     return c.add(_combined(basis.matrix, q), problem.sections.rest)
 
@@ -72,7 +78,7 @@ def _projected(matrix: Array, wrench: Vector, grid: Grid) -> Array:
 
 
 def _gathered(matrix: Array, wrenches: Vector, grid: Grid) -> Array:
-    r"""Generalised forces of wrenches that stand in an axis behind the nodes, in columns."""
+    r"""Generalised forces, in columns, of wrenches stacked in an axis behind those of the nodes."""
     weighted = jnp.stack(
         [jnp.expand_dims(grid.weight, 2) * f for f in jnp.broadcast_arrays(*wrenches)]
     )
@@ -80,7 +86,7 @@ def _gathered(matrix: Array, wrenches: Vector, grid: Grid) -> Array:
 
 
 def shares(
-    xi: Vector, q: Array, basis: Basis, problem: Problem, kind: Kind
+    xi: Vector, q: Array, basis: NodalBasis, problem: ArmProblem, kind: Kind
 ) -> tuple[Array | None, ...]:
     """Share of each thread's force at the nodes."""
     shares = list(problem.sections.reach)
@@ -95,8 +101,10 @@ def shares(
     return tuple(shares)
 
 
-def state_of(unknown: Unknown, basis: Basis, problem: Problem, kind: Kind) -> At:
-    """What follows from the unknowns."""
+def state_of(
+    unknown: GalerkinUnknown, basis: NodalBasis, problem: ArmProblem, kind: Kind
+) -> GalerkinState:
+    """Quantities computed from the unknowns."""
     grid, xi = problem.grid, strain(unknown.q, basis, problem)
     share = shares(xi, unknown.q, basis, problem, kind)
     tau = shared(with_tensions(problem.forces, unknown.tension, kind), share)
@@ -105,32 +113,34 @@ def state_of(unknown: Unknown, basis: Basis, problem: Problem, kind: Kind) -> At
         cable.slack(tension, path_length(xi, problem.sections, place, grid), share[place], grid)
         for place, cable, tension in zip(kind.cables, problem.cables, unknown.tension, strict=True)
     )
-    return At(xi, share, tau, along, slack)
+    return GalerkinState(xi, share, tau, along, slack)
 
 
-def imbalance(unknown: Unknown, at: At, basis: Basis, problem: Problem) -> Unknown:
-    """Residual: generalised force, and for each cable the lesser of tension and scaled slack
+def imbalance(
+    unknown: GalerkinUnknown, at: GalerkinState, basis: NodalBasis, problem: ArmProblem
+) -> GalerkinUnknown:
+    """Residual: generalised force, and for each cable the smaller of tension and scaled slack
     [N]."""
     r = residual(at.xi, problem.sections, at.tau, None if at.along is None else at.along.wrench)
     rows = [
         cable.complementarity(tension, slack)
         for cable, tension, slack in zip(problem.cables, unknown.tension, at.slack, strict=True)
     ]
-    return Unknown(
+    return GalerkinUnknown(
         _projected(basis.matrix, r, problem.grid), jnp.stack(rows) if rows else unknown.tension
     )
 
 
 def approximate_tangent(
-    unknown: Unknown, at: At, basis: Basis, problem: Problem, kind: Kind
+    unknown: GalerkinUnknown, at: GalerkinState, basis: NodalBasis, problem: ArmProblem, kind: Kind
 ) -> Array:
-    """Derivative of the residual, friction's own part left out, to the order of the nodes'
-    quadrature and in single precision."""
+    """Derivative of the residual without the tangent of friction, to the order of the quadrature
+    and in single precision."""
     unknown, at, basis, problem = c.single((unknown, at, basis, problem))
     sections, grid, matrix = problem.sections, problem.grid, basis.matrix
     columns = tuple(
         matrix[:, :, i] for i in range(6)
-    )  # the coordinates in an axis behind the nodes
+    )  # with the coordinates in an axis behind those of the nodes
     behind = grid.h.ndim - 1
 
     def beside(tree: c.Tree) -> c.Tree:
@@ -149,11 +159,11 @@ def approximate_tangent(
         for i in kind.cables
     ]
     pulls = [
-        _projected(matrix, c.scale(_one(at.shares[i]), unit), grid)
+        _projected(matrix, c.times(at.shares[i], unit), grid)
         for i, unit in zip(kind.cables, units, strict=True)
     ]
     lengths = [
-        _projected(matrix, c.scale(_one(sections.reach[i]), unit), grid)
+        _projected(matrix, c.times(sections.reach[i], unit), grid)
         for i, unit in zip(kind.cables, units, strict=True)
     ]
     rows = []
@@ -174,14 +184,14 @@ def approximate_tangent(
     )
 
 
-def _one(share: Array | None) -> Array | float:
-    return 1.0 if share is None else share
-
-
 class _Sizes(NamedTuple):
-    """Sizes of changes: `gram` G with $q^T G q$ the mean square of a change's `shape_size`, the
-    factors of K, the shape that each cable's tension makes [1/N], and a stiffness [N] by which the
-    slack of cables is compared."""
+    """Dimensionless sizes of changes and residuals.
+
+    - `gram`: G, where $q^T G q$ is the mean square of `shape_size` along the arm.
+    - `factors`: of K.
+    - `pulls`: `pull_of` each cable [1/N].
+    - `axial`: stiffness [N] that scales the residual of cables.
+    """
 
     gram: Float[Array, "dofs dofs *arms"]
     factors: Float[Array, "dofs dofs *arms"]
@@ -189,20 +199,20 @@ class _Sizes(NamedTuple):
     axial: Array
 
     def turn(self, q: Array) -> Array:
-        """Root of the mean square of a change of shape along the arm."""
+        """Root mean square of the change of shape along the arm."""
         return jnp.sqrt(jnp.maximum(jnp.sum(q * jnp.sum(self.gram * q, axis=1), axis=0), 0.0))
 
-    def of_step(self, step: Unknown) -> Array:
+    def of_step(self, step: GalerkinUnknown) -> Array:
         """Size of a change of the unknowns."""
         return self.turn(step.q) + jnp.sum(self.pulls * jnp.abs(step.tension), axis=0)
 
-    def of_imbalance(self, r: Unknown) -> Array:
-        """Size of the change that an imbalance makes of an arm at rest."""
+    def of_imbalance(self, r: GalerkinUnknown) -> Array:
+        """Size of the change of an arm at rest under a residual."""
         square = self.turn(lu.substitute(self.factors, r.q)) ** 2
         return jnp.sqrt(square + jnp.sum((r.tension / self.axial) ** 2, axis=0))
 
 
-def _sizes_of(basis: Basis, K: Array, problem: Problem, kind: Kind) -> _Sizes:
+def _sizes_of(basis: NodalBasis, K: Array, problem: ArmProblem, kind: Kind) -> _Sizes:
     grid, sections = problem.grid, problem.sections
     length = jnp.sum(grid.h, axis=0)
     gram = [
@@ -210,12 +220,11 @@ def _sizes_of(basis: Basis, K: Array, problem: Problem, kind: Kind) -> _Sizes:
         for m, w in _by_strain(basis.matrix, length)
     ]
     pulls = [jnp.max(pull_of(sections, place, length), axis=(0, 1)) for place in kind.cables]
-    axial = jnp.max(sections.stiffness[3], axis=(0, 1))
     return _Sizes(
         sum(gram[1:], gram[0]),
         lu.factor(K),
         jnp.stack(pulls) if pulls else jnp.zeros((0, *length.shape), K.dtype),
-        axial,
+        largest_force_scale(sections.stiffness),
     )
 
 
@@ -223,14 +232,38 @@ def _by_strain(matrix: Array, length: Array) -> list[tuple[Array, Array | float]
     return [(matrix[:, :, i], length**2 if i < 3 else 1.0) for i in range(6)]
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(2,))
-def solve_prescribed(basis: Basis, problem: Problem, kind: Kind) -> Solution:
-    """Equilibrium in the basis, by damped Newton steps from rest. Derivatives are implicit, of any
-    order."""
-    return side_by_side(partial(_solve, kind))(basis, problem)
+def solve_prescribed(basis: NodalBasis, problem: ArmProblem, kind: Kind) -> Root:
+    """Equilibrium in the basis, by damped Newton steps from rest; its point is a `GalerkinUnknown`.
+
+    Derivatives are implicit, of any order, in forward and reverse mode.
+    """
+
+    def row(unknown: GalerkinUnknown, basis: NodalBasis, problem: ArmProblem) -> Array:
+        """Residual in a row."""
+        return jnp.concatenate(
+            imbalance(unknown, state_of(unknown, basis, problem, kind), basis, problem)
+        )
+
+    def linear_solve(
+        unknown: GalerkinUnknown, basis: NodalBasis, problem: ArmProblem, right: Array
+    ) -> GalerkinUnknown:
+        split = partial(_split, size=unknown.q.size)
+        J = jax.jacfwd(lambda z: row(split(z), basis, problem))(jnp.concatenate(unknown))
+        return split(lu.solve(J, right))
+
+    def at_rest(unknown: GalerkinUnknown, basis: NodalBasis, problem: ArmProblem) -> tuple:
+        return jax.tree.map(jnp.zeros_like, unknown), basis, problem.at_rest()
+
+    find = side_by_side(partial(_solve, kind))
+    return implicit_root(find, row, linear_solve, at_rest, basis, problem)
 
 
-def _solve(kind: Kind, basis: Basis, problem: Problem) -> Solution:
+def _split(z: Array, size: int) -> GalerkinUnknown:
+    """Coordinates and tensions from a row of both."""
+    return GalerkinUnknown(z[:size], z[size:])
+
+
+def _solve(kind: Kind, basis: NodalBasis, problem: ArmProblem) -> Root:
     stiffness = problem.sections.stiffness
     behind = problem.grid.h.ndim - 1
     arms = arms_in((basis, problem), behind)
@@ -243,61 +276,31 @@ def _solve(kind: Kind, basis: Basis, problem: Problem) -> Solution:
     sizes = _sizes_of(basis, K, problem, kind)
     size = K.shape[0]
 
-    def evaluate(unknown: Unknown, damping: Array, share: Array) -> Damped:
+    def evaluate(unknown: GalerkinUnknown, damping: Array, share: Array) -> Damped:
         part = problem.with_share(share)
         at = state_of(unknown, basis, part, kind)
         r = imbalance(unknown, at, basis, part)
         J = approximate_tangent(unknown, at, basis, part, kind)
         factors = lu.factor(J.at[:size, :size].add((damping * K).astype(J.dtype)))
-        flat = lu.substitute(factors, jnp.concatenate(c.single(r)))
-        turn = sizes.turn(flat[:size].astype(K.dtype))
-        step = Unknown(flat[:size].astype(K.dtype), flat[size:].astype(K.dtype))
+        step = _split(lu.substitute(factors, jnp.concatenate(c.single(r))).astype(K.dtype), size)
+        turn = sizes.turn(step.q)
         moved = sizes.of_step(step)
-        cut = MOST_TURN / jnp.maximum(turn, MOST_TURN)
+        cut = MAX_TURN / jnp.maximum(turn, MAX_TURN)
         falling = (
             lu.diagonal(factors) <= 0
-        )  # taut cables hold as many motions as their own rows have such pivots
+        )  # taut cables prevent as many unstable motions as their own rows have negative pivots
         definite = jnp.sum(falling[:size], axis=0) == jnp.sum(falling[size:], axis=0)
         return Damped(
             jax.tree.map(lambda x: cut * x, step), moved, r.q, sizes.of_imbalance(r), definite
         )
 
-    def work(force: Array, step: Unknown) -> Array:
+    def work(force: Array, step: GalerkinUnknown) -> Array:
         return jnp.sum(force * step.q, axis=0)
 
-    start = Unknown(
+    start = GalerkinUnknown(
         jnp.zeros((size, *arms), K.dtype), jnp.zeros((len(kind.cables), *arms), K.dtype)
     )
     floor = jnp.broadcast_to(rounding_of(problem), arms)
-    return damped_newton(evaluate, work, start, floor, 1 if problem.loads is None else LOAD_SHARES)
-
-
-def _residual(unknown: Unknown, basis: Basis, problem: Problem, kind: Kind) -> Array:
-    """Residual in a row."""
-    return jnp.concatenate(
-        imbalance(unknown, state_of(unknown, basis, problem, kind), basis, problem)
+    return damped_newton(
+        evaluate, work, start, floor, 1 if problem.loads is None else LOAD_INCREMENTS
     )
-
-
-def _jacobian(unknown: Unknown, basis: Basis, problem: Problem, kind: Kind) -> Array:
-    """Exact derivative of the residual by the coordinates and the tensions."""
-    size = unknown.q.size
-    return jax.jacfwd(lambda z: _residual(Unknown(z[:size], z[size:]), basis, problem, kind))(
-        jnp.concatenate(unknown)
-    )
-
-
-@partial(solve_prescribed.defjvp, symbolic_zeros=True)
-def _solve_prescribed_jvp(kind: Kind, primals: tuple, tangents: tuple) -> tuple[Solution, Solution]:
-    solution = solve_prescribed(*primals, kind)
-    sound = solution.balanced & solution.definite
-    unknown = Unknown(*(jnp.where(sound, x, 0.0) for x in solution.unknown))
-
-    change = change_of(
-        lambda basis, problem: _residual(unknown, basis, harmless(problem, sound), kind),
-        primals,
-        tangents,
-    )
-    J = _jacobian(unknown, primals[0], harmless(primals[1], sound), kind)
-    flat, size = -lu.solve(J, change), unknown.q.size
-    return solution, Solution(Unknown(flat[:size], flat[size:]), *no_derivative(*solution[1:]))

@@ -7,10 +7,10 @@ becomes
 $$\xi' = (\Sigma - A)^{-1} (\Lambda' - \partial r / \partial X + B_\tau \tau'), \quad
 g' = g \hat\xi,$$
 
-with $\Lambda = r(\xi)$. The rotation is known at the base and the reaction at the tip. One shot
-over a long soft arm is ill-conditioned, so the arm is cut into segments, at its breakpoints among
-others; the rotation and the reaction at the start of each are unknown and continuous but for the
-point loads. The first guess is a solution on steps.
+with $\Lambda = r(\xi)$. The rotation is known at the base and the reaction at the tip. Single
+shooting over a long soft arm is ill-conditioned, so the arm is divided into segments, also at its
+breakpoints. The unknowns are the rotation and the reaction at the start of each segment, continuous
+except for point loads. The initial guess is a solution on steps.
 """
 
 from typing import Any, NamedTuple
@@ -24,14 +24,18 @@ from jaxtyping import Array
 from ..arm.scene import CrossSections, Scene, shared
 from ..mechanics.arm_balance import shares_at
 from ..mechanics.balance import residual, solve_balance
-from ..mechanics.friction import reaction_rate, strain_rate
+from ..mechanics.friction import balanced_strain_rate, reaction_rate
 from ..numerics import component as c
-from ..numerics.component import Vector
+from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import Grid
-from ..numerics.se3 import hat, rotation_components
+from ..numerics.se3 import base_pose, hat, rotation_components, unskew
 
 _SHOTS = 12
-_INSIDE = 1e-10  # of a segment: what is evaluated at its ends belongs to it
+"""Bound on the Newton steps of the shooting; from a solution on steps they converge
+quadratically."""
+_INSIDE = 1e-10
+"""Distance from the ends of a segment, as a fraction of it, at which it is evaluated there: at a
+jump the values are those inside the segment."""
 
 
 class Guess(NamedTuple):
@@ -40,11 +44,11 @@ class Guess(NamedTuple):
 
     grid: Grid
     xi: Vector
-    forces: Vector
+    forces: Forces
     turning: Vector
 
 
-class Unknown(NamedTuple):
+class ShootingUnknown(NamedTuple):
     """Rotation (3, 3) and reaction (6,) at the start of each segment."""
 
     rotation: Array
@@ -52,15 +56,14 @@ class Unknown(NamedTuple):
 
 
 class Line(NamedTuple):
-    """What is integrated over a segment: the strain, the pose relative to its start, and the
-    rotation in the world frame."""
+    """State integrated over a segment: the strain, and the pose relative to the start."""
 
     xi: Array
     g: Array
 
 
 class Control(NamedTuple):
-    """How diffrax integrates: solver, tolerances and the bound on its steps."""
+    """Settings of diffrax: solver, tolerances and the bound on its steps."""
 
     solver: Any
     rtol: float
@@ -70,11 +73,11 @@ class Control(NamedTuple):
 
 class Shot(NamedTuple):
     """Solution: the segments (a grid with one step each), the unknowns, the pose at the start of
-    each and at the end of the arm, whether the segments fit and the largest number of integration
-    steps."""
+    each and at the end of the arm, whether the segments match, and the largest number of
+    integration steps."""
 
     segments: Grid
-    unknown: Unknown
+    unknown: ShootingUnknown
     poses: Array
     fits: Array
     steps: Array
@@ -90,8 +93,8 @@ def integrate(
     reaction: Array,
     part: Array,
 ) -> tuple[Line, Array, Array]:
-    """Strain, and pose relative to the segment's start, at a part of it; whether diffrax got there,
-    and its steps."""
+    """Strain and pose relative to the start of a segment at a fraction `part` of it, whether
+    diffrax succeeded, and its steps."""
     free = scene.free
 
     def at(t: Array) -> tuple[Array, CrossSections, Vector]:
@@ -106,7 +109,7 @@ def integrate(
         xi = c.split(line.xi)
         wrench = residual(xi, sections, tau)
         density = _body_density(scene, x, rotation @ line.g[:3, :3])
-        xi_rate = strain_rate(
+        xi_rate = balanced_strain_rate(
             xi, tau, rate[2], reaction_rate(xi, wrench, density), sections, rate[1], free
         )
         return Line(h * c.join(xi_rate), h * (line.g @ hat(line.xi)))
@@ -148,12 +151,17 @@ def _body_density(scene: Scene, X: Array, rotation: Array) -> Vector:
 
 
 def shoot(
-    scene: Scene, guess: Guess, first: Unknown, segments: Grid, control: Control, tolerance: float
+    scene: Scene,
+    guess: Guess,
+    first: ShootingUnknown,
+    segments: Grid,
+    control: Control,
+    tolerance: float,
 ) -> Shot:
-    """Rotations and reactions at the start of the segments with which they fit together."""
+    """Rotations and reactions at the start of the segments for which neighbours match."""
 
     def over(start: Array, h: Array, rotation: Array, reaction: Array) -> tuple[Array, tuple]:
-        """Strain's reaction and rotation at the end, as one array."""
+        """Reaction and rotation at the end, as one array."""
         line, done, steps = integrate(
             scene, guess, control, start, h, rotation, reaction, jnp.ones_like(h)
         )
@@ -172,8 +180,10 @@ def shoot(
     def turned(R: Array, k: Array) -> Array:
         return R @ c.join_matrix(rotation_components(c.split(k)))
 
-    def place(z: Array) -> Unknown:
-        return Unknown(jax.vmap(turned)(first.rotation, z[:, :3]), first.reaction + z[:, 3:])
+    def place(z: Array) -> ShootingUnknown:
+        return ShootingUnknown(
+            jax.vmap(turned)(first.rotation, z[:, :3]), first.reaction + z[:, 3:]
+        )
 
     def misfit(z: Array, ends: Array) -> Array:
         return _misfit(scene, place(z), ends, segments) / scale
@@ -218,9 +228,9 @@ def shoot(
     )
 
 
-def _scale(scene: Scene, first: Unknown, count: int) -> Array:
-    """Sizes of the unknowns of each segment: a radian, and the reaction or what bends the arm by a
-    radian if that is more."""
+def _scale(scene: Scene, first: ShootingUnknown, count: int) -> Array:
+    """Scales of the unknowns of each segment: 1 rad, and the reaction or, if larger, the wrench
+    that bends the arm by 1 rad."""
     length = scene.rod.length
     moment = jnp.max(jnp.stack(scene.rod.stiffness(0.5 * length)[:3])) / length
     size = jnp.maximum(
@@ -230,16 +240,14 @@ def _scale(scene: Scene, first: Unknown, count: int) -> Array:
     return jnp.broadcast_to(jnp.concatenate([jnp.ones_like(size[:3]), size]), (count, 9))
 
 
-def _misfit(scene: Scene, unknown: Unknown, ends: Array, segments: Grid) -> Array:
-    """What is wrong at the start of each segment: rotation (3) against the one before, reaction (6)
-    at its end against the next."""
-    base = jnp.eye(3, dtype=ends.dtype) if scene.rod.base is None else scene.rod.base[:3, :3]
+def _misfit(scene: Scene, unknown: ShootingUnknown, ends: Array, segments: Grid) -> Array:
+    """Mismatch of the segments: rotation (3) at the start against the end of the segment before,
+    reaction (6) at the end against the start of the next."""
+    base = base_pose(scene.rod.base, ends.dtype)[:3, :3]
     wrench, rotation = ends[:, :6], ends[:, 6:].reshape(-1, 3, 3)
     before = jnp.concatenate([base[None], rotation[:-1]])
     m = jnp.einsum("sji,sjk->sik", before, unknown.rotation)
-    turn = 0.5 * jnp.stack(
-        [m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]], axis=1
-    )
+    turn = unskew(m)
     carried = jnp.concatenate([unknown.reaction[1:], jnp.zeros_like(wrench[:1])])
     for frame in ("world", "body"):
         for X, point in scene.point_wrenches(frame):

@@ -1,8 +1,8 @@
-r"""The model of eq. 19-21: the basis $B_q = \Sigma^{-1} B_\tau(\xi)$ makes $q = \tau$, and the
-strain is solved at the nodes.
+r"""The strain-dependent model (eq. 19-21): with the basis $B_q = \Sigma^{-1} B_\tau(\xi)$ the
+coordinates are $q = \tau$, and the strain is solved at the nodes.
 
-Without loads every node is solved alone. With them the reaction to the loads is part of each node's
-balance, and the nodes are solved together (see `coupled`).
+Without loads each node is solved alone. With loads the reaction is part of the balance of each node
+and all nodes are solved together (see `arm_balance`).
 """
 
 import equinox as eqx
@@ -11,11 +11,11 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..arm.scene import Scene, shared
-from ..mechanics.arm_balance import Unknown, problem_of, shares_at, state_of, with_tensions
+from ..mechanics.arm_balance import ArmUnknown, problem_of, shares_at, state_of, with_tensions
 from ..mechanics.arm_solve import solve_arm
 from ..mechanics.balance import forces_where, newton_step, solve_balance, spread
 from ..mechanics.reaction import loading, react_at
-from ..numerics.component import Vector
+from ..numerics.component import Forces, Vector
 from ..numerics.magnus import ORDERS
 from ..validation import choice, count
 from .base import Nodes, Outcome, Status, SteppedModel, classify, rest_where_failed
@@ -26,13 +26,14 @@ class StrainDependent(SteppedModel):
     \Lambda) + \xi^*$ (eq. 21).
 
     Without loads $\Lambda = 0$ and the strain is exact; the only error is that of the pose steps.
-    With loads the reaction is that of the steps' shape, and the pose at the ends of the steps keeps
-    their order.
+    With loads the reaction is computed on the same steps, and the pose at their ends has their
+    order.
 
     **Arguments:**
-    - `steps`: steps along the arm, at least one on each of its smooth pieces, the others by their
-      lengths.
-    - `order`: order of the steps, 2, 4 (Zanna's, eq. 5) or 6, with one, two or three nodes each.
+    - `steps`: steps along the arm, at least one on each smooth piece, the others distributed by
+      length.
+    - `order`: order of the steps, 2, 4 (Zanna's, eq. 5) or 6, with one, two or three nodes per
+      step.
     """
 
     steps: int = eqx.field(static=True)
@@ -53,7 +54,7 @@ class StrainDependent(SteppedModel):
         status = jnp.where(
             status == Status.CONVERGED, _status_of_ends(scene, forces, solution.xi), status
         )
-        state = Unknown(rest_where_failed(status, solution.xi, sections), (), ())
+        state = ArmUnknown(rest_where_failed(status, solution.xi, sections), (), ())
         return Outcome(state, forces, status, solution.steps)
 
     def _solve_together(self, scene: Scene, inputs: Float[Array, " inputs"]) -> Outcome:
@@ -66,12 +67,14 @@ class StrainDependent(SteppedModel):
         sound = status == Status.CONVERGED
         forces = forces_where(sound, with_tensions(problem.forces, unknown.tension, kind))
         xi = rest_where_failed(status, unknown.xi, problem.sections)
-        return Outcome(Unknown(xi, (), forces_where(sound, unknown.turning)), forces, status, steps)
+        return Outcome(
+            ArmUnknown(xi, (), forces_where(sound, unknown.turning)), forces, status, steps
+        )
 
-    def node_strain(self, scene: Scene, state: Unknown) -> Vector:
+    def node_strain(self, scene: Scene, state: ArmUnknown) -> Vector:
         return state.xi
 
-    def nodes(self, scene: Scene, forces: Vector, state: Unknown) -> Nodes:
+    def nodes(self, scene: Scene, forces: Forces, state: ArmUnknown) -> Nodes:
         grid = self.grid(scene)
         return Nodes(
             grid,
@@ -80,14 +83,14 @@ class StrainDependent(SteppedModel):
             shares_at(scene, state.xi, state.turning, grid, grid.X),
         )
 
-    def coordinates(self, scene: Scene, forces: Vector, state: Unknown) -> Float[Array, " dofs"]:
+    def coordinates(self, scene: Scene, forces: Forces, state: ArmUnknown) -> Float[Array, " dofs"]:
         return jnp.array(forces, state.xi[0].dtype)
 
     def dofs(self, scene: Scene) -> int:
         return len(scene.actuators)
 
     def strain(
-        self, scene: Scene, forces: Vector, state: Unknown, X: Float[Array, " stations"]
+        self, scene: Scene, forces: Forces, state: ArmUnknown, X: Float[Array, " stations"]
     ) -> Vector:
         grid = self.grid(scene)
         loads = loading(scene, grid)
@@ -97,9 +100,9 @@ class StrainDependent(SteppedModel):
         return solve_balance(scene.sections(X), tau, reaction, scene.free, start).xi
 
 
-def _status_of_ends(scene: Scene, forces: Vector, xi: Vector) -> Array:
-    """Status of the arm's two ends, which no node sees: a tapering arm fails at its tip first. One
-    Newton step from the strain at the node beside is exact enough to tell."""
+def _status_of_ends(scene: Scene, forces: Forces, xi: Vector) -> Array:
+    """Status of the two ends of the arm, where no node lies: a tapered arm fails at its tip first.
+    One Newton step from the strain at the nearest node is accurate enough."""
     sections = scene.sections(jnp.stack([jnp.zeros_like(scene.rod.length), scene.rod.length]))
     tau = sections.carry(forces)
     beside = lax.stop_gradient(tuple(jnp.stack([x[0, 0], x[-1, -1]]) for x in xi))

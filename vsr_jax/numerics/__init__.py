@@ -1,7 +1,7 @@
-"""Numerical methods that know no arm: twists and poses, quadrature, Newton's method, implicit
-derivatives, small linear algebra.
+"""Numerical methods: twists and poses, quadrature, Newton's method, implicit derivatives, small
+linear algebra.
 
-Must not know what a rod, a thread or a load is: everything here takes arrays and functions.
+Independent of rods, threads and loads: everything here takes arrays and functions.
 """
 
 from . import se3

@@ -1,5 +1,5 @@
-"""A batch of arms in the last axis of a solver's arrays, where passes along the arm read and write
-whole rows."""
+"""Batches of arms in the last axis of a solver's arrays, so that passes along the arm use
+contiguous rows."""
 
 from collections.abc import Callable
 from typing import Any
@@ -10,19 +10,19 @@ import numpy as np
 from jax.custom_batching import custom_vmap
 
 _ALIASED = 64
-"""Arms side by side come in no multiple of this: their rows would all fall on the same few lines of
-a processor's cache."""
+"""Batch sizes that are multiples of this are padded: their rows would all map to the same few cache
+lines."""
 
 
 def side_by_side(solve: Callable) -> Callable:
-    """`solve` with another rule for `jax.vmap`: the batch goes into the last axis of every array.
+    """`solve` with a rule for `jax.vmap` that puts the batch into the last axis of every array.
 
-    With the batch in front every array that goes through a pass along the arm is transposed on the
-    way in and out, which took most of the time. Eight more arms, copies of the last, cost less than
-    rows of a power of two.
+    With the batch in the first axis, every array is transposed before and after each pass along the
+    arm, which took most of the time. Padding with eight copies of the last arm costs less than rows
+    whose length is a power of two.
 
-    **Arguments:** `solve`: takes pytrees of arrays and returns one; with arms side by side each
-    array has one more axis at its end, of size 1 where it is the same for all arms.
+    **Arguments:** `solve`: takes pytrees of arrays and returns one. For a batch each array has one
+    more axis at its end, of size 1 where it is the same for all arms.
     """
 
     @custom_vmap
@@ -32,7 +32,7 @@ def side_by_side(solve: Callable) -> Callable:
     @batched_solve.def_vmap
     def _(size: int, batched: list, *arguments: Any) -> tuple[Any, Any]:
         batch_size = size + 8 if size % _ALIASED == 0 else size
-        # copies of the last arm fill the row; of an empty batch there is none
+        # copies of the last arm fill the row; an empty batch has none
         place = jnp.minimum(jnp.arange(batch_size), max(size - 1, 0))
 
         def row(x: Any, along: bool) -> Any:
@@ -52,5 +52,5 @@ def side_by_side(solve: Callable) -> Callable:
 
 
 def arms_in(tree: Any, axes: int) -> tuple[int, ...]:
-    """Shape of the arms side by side: what the last `axes` axes of all arrays broadcast to."""
+    """Shape of the batch of arms: what the last `axes` axes of all arrays broadcast to."""
     return np.broadcast_shapes(*(x.shape[x.ndim - axes :] for x in jax.tree.leaves(tree)))

@@ -1,16 +1,16 @@
 r"""Least squares within the unit box: $\min_s \frac12 |f(s)|^2 + \frac12 w^2 |s - s_0|^2$, $0 \le
-s_i \le 1$, for a falling weight w.
+s_i \le 1$, for a decreasing weight w.
 
-Damped Gauss-Newton steps with what they leave out, $S \approx \sum_j f_j \nabla^2 f_j$, gathered
-from the Jacobians of successive points by symmetric updates of rank one. It is what counts along
-the curved set of all s with f(s) = 0, where the weight alone chooses: Gauss-Newton steps without it
-need not converge there at all. Numbers that are pushed against a bound are held; steps of the
-others go on along a bound where they meet it.
+Damped Gauss-Newton steps. The term that they neglect, $S \approx \sum_j f_j \nabla^2 f_j$, is
+approximated from the Jacobians of successive points by symmetric rank-one updates. It matters along
+the curved set of all s with f(s) = 0, where only the weight determines s: without it Gauss-Newton
+steps may not converge there. Components that are pushed against a bound are fixed; steps of the
+others continue along a bound that they meet.
 
-The last weight is zero, which takes s from the regularised solution to the nearest with the least
-|f|. A start that does not lead to |f| as small as allowed is tried again with the last two weights
-alone, which keep near to it, and so is the next. All is one loop with one Jacobian a turn, so that
-in a batch none waits for another to end a stage.
+The last weight is zero: from the regularised solution s moves to the nearest point with the least
+|f|. If |f| is not as small as allowed, the next start is tried with the last two weights only,
+which stay close to it. All stages are one loop with one Jacobian per iteration, so that no problem
+of a batch waits for another to end a stage.
 
 **Source:** J. E. Dennis, D. M. Gay and R. E. Welsch, An adaptive nonlinear least-squares algorithm,
 ACM Trans. Math. Softw. 7 (1981).
@@ -25,27 +25,29 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ..typing import Scalar
+from .component import select
 
 _POWERS = (1 / 8, 3 / 16, 5 / 16)
-"""Exponents of the machine's epsilon that give the weights; the normal equations hold the square of
-the last."""
+"""The weights as powers of the machine epsilon; the square of the last is still resolved in the
+normal equations."""
 _STILL = (1 / 8, 1 / 4, 7 / 16, 5 / 8)
-"""Those of the longest step that ends each stage."""
+"""Longest step that ends each stage, as powers of the machine epsilon."""
 _STEPS = 120
-"""Steps from one start at most."""
+"""Bound on the steps from one start."""
 _DAMPING, _LEAST, _GREATEST = 1e-2, 1e-3, 1e4
-"""Damping at the start; its least, in squares of the weight; and that at which a stage is given
-up."""
+"""Damping at the start, its minimum in squares of the weight, and the damping at which a stage is
+given up."""
 _KNOWN = 1e-6
-"""Cosine above which two directions tell each other's curvature."""
+"""Cosine of two directions above which the curvature update is used; below, its denominator is
+nearly zero."""
 
 
 class Nearest(NamedTuple):
-    """What was found.
+    """Result of `nearest`.
 
-    - `share`: where |f| is least, beside the place where the effort is least too.
-    - `regular`: where the sum with the last weight above zero is least.
-    - `free`: which numbers no bound holds there.
+    - `share`: the point with the least |f|, next to the regularised solution.
+    - `regular`: the regularised solution, for the last weight above zero.
+    - `free`: which of its components are not fixed at a bound.
     """
 
     share: Float[Array, " n"]
@@ -61,9 +63,9 @@ class _Point(NamedTuple):
     J: Array
 
 
-class _State(NamedTuple):
-    """Where the search is: `ahead` is tried next and promises `descent`; before the first step it
-    is a start."""
+class _Search(NamedTuple):
+    """State of the search: `ahead` is the next trial point with the predicted `descent`; before the
+    first step it is a start."""
 
     point: _Point
     ahead: Array
@@ -78,7 +80,7 @@ class _State(NamedTuple):
     miss: Array
 
 
-def weight(dtype: Any) -> float:
+def last_weight(dtype: Any) -> float:
     """The last weight above zero."""
     return float(jnp.finfo(dtype).eps) ** _POWERS[-1]
 
@@ -89,21 +91,21 @@ def nearest(
     rest: Float[Array, " n"],
     allowed: Scalar,
 ) -> Nearest:
-    """Where |f| is at most `allowed`, from the first start that leads there, or else the least
-    found.
+    """Point where |f| is at most `allowed`, from the first start that leads to one, or else the
+    point with the least |f| found.
 
-    **Arguments:** `f`: of shape (m,), where not finite no step goes; `rest`: the $s_0$ of the
-    effort. Not to be differentiated.
+    **Arguments:** `f`: of shape (m,); no step ends where it is not finite. `rest`: $s_0$. The
+    result must not be differentiated.
     """
     eps = float(jnp.finfo(rest.dtype).eps)
     weights = jnp.asarray([*(eps**power for power in _POWERS), 0.0], rest.dtype)
     still = jnp.asarray([eps**power for power in _STILL], rest.dtype)
     jacobian = jax.jacfwd(lambda s: (f(s),) * 2, has_aux=True)
 
-    def advance(state: _State) -> _State:
+    def advance(state: _Search) -> _Search:
         J, value = jacobian(state.ahead)
         w = weights[state.stage]
-        least = jnp.maximum(w, weight(w.dtype)) ** 2
+        least = jnp.maximum(w, last_weight(w.dtype)) ** 2
         moved = jnp.max(jnp.abs(state.ahead - state.point.s))
         short = (moved <= still[state.stage]) & (state.damping <= least)
         state = _judged(state, _Point(state.ahead, value, J), w, rest)
@@ -111,52 +113,49 @@ def nearest(
         regular = Nearest(
             state.point.s, state.point.s, _free(state.point.s, _slope(state.point, w, rest))
         )
-        found = _chosen(over & (w > 0), regular, state.found)._replace(share=state.point.s)
+        found = select(over & (w > 0), regular, state.found)._replace(share=state.point.s)
         state = state._replace(found=found, stage=state.stage + over)
-        return _chosen(
+        return select(
             state.stage == len(weights), _ended(state, starts), _aimed(state, over, weights, rest)
         )
 
-    def pending(state: _State) -> Array:
+    def pending(state: _Search) -> Array:
         return (state.start <= len(starts)) & (state.miss > allowed)
 
     return lax.while_loop(pending, advance, _begun(f, starts, allowed)).best
 
 
-def _chosen(condition: Array, this: Any, that: Any) -> Any:
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), this, that)
-
-
-def _begun(f: Callable[[Array], Array], starts: Array, allowed: Scalar) -> _State:
+def _begun(f: Callable[[Array], Array], starts: Array, allowed: Scalar) -> _Search:
     s, zero = starts[0], jnp.zeros((), jnp.int32)
     size = jax.eval_shape(f, s).size
     point = _Point(s, jnp.zeros(size, s.dtype), jnp.zeros((size, s.size), s.dtype))
     nowhere = Nearest(s, s, jnp.ones(s.shape, bool))
     one, flat = jnp.ones((), s.dtype), jnp.zeros((s.size, s.size), s.dtype)
-    return _State(
+    return _Search(
         point, s, one, flat, one, zero, zero, zero, nowhere, nowhere, jnp.full((), jnp.inf, s.dtype)
     )
 
 
-def _judged(state: _State, trial: _Point, w: Array, rest: Array) -> _State:
-    """The trial taken where it is better, or a start; damping and curvature by what it told."""
+def _judged(state: _Search, trial: _Point, w: Array, rest: Array) -> _Search:
+    """Accept the trial point where it is better, or a start; update damping and curvature."""
     fresh = state.steps == 0
     gain = (_cost(state.point, w, rest) - _cost(trial, w, rest)) / state.descent
     better = fresh | ((gain > 0) & (state.descent > 0))
     factor = jnp.where(better, jnp.where(gain > 0.75, 0.1, jnp.where(gain < 0.25, 3.0, 1.0)), 4.0)
     curvature = jnp.where(better, _updated(state.curvature, state.point, trial), state.curvature)
     return state._replace(
-        point=_chosen(better, trial, state.point),
+        point=select(better, trial, state.point),
         curvature=jnp.where(fresh, 0.0, curvature),
         damping=jnp.where(fresh, _DAMPING, factor * state.damping),
         steps=state.steps + 1,
     )
 
 
-def _aimed(state: _State, over: Array, weights: Array, rest: Array) -> _State:
-    """The next step; at the beginning of a stage with what is scaled by the weight scaled anew."""
+def _aimed(state: _Search, over: Array, weights: Array, rest: Array) -> _Search:
+    """The next step. At the beginning of a stage damping and curvature are rescaled with the
+    weight."""
     w, before = weights[state.stage], weights[jnp.maximum(state.stage - 1, 0)]
-    least = jnp.maximum(w, weight(w.dtype)) ** 2
+    least = jnp.maximum(w, last_weight(w.dtype)) ** 2
     curvature = jnp.where(over, (w / before) ** 2, 1.0) * state.curvature
     damping = jnp.maximum(
         jnp.where(over, jnp.minimum(state.damping, least), state.damping), _LEAST * least
@@ -167,8 +166,8 @@ def _aimed(state: _State, over: Array, weights: Array, rest: Array) -> _State:
     )
 
 
-def _ended(state: _State, starts: Array) -> _State:
-    """After the last stage: its result, if it is nearer than those before, and the next start."""
+def _ended(state: _Search, starts: Array) -> _Search:
+    """After the last stage: keep its result if it is the best so far, and go to the next start."""
     there = jnp.linalg.norm(state.point.f)
     nearer = there < state.miss
     start = state.start + 1
@@ -177,7 +176,7 @@ def _ended(state: _State, starts: Array) -> _State:
         start=start,
         stage=jnp.full_like(state.stage, len(_POWERS) - 1),
         steps=jnp.zeros_like(state.steps),
-        best=_chosen(nearer, state.found, state.best),
+        best=select(nearer, state.found, state.best),
         miss=jnp.where(nearer, there, state.miss),
     )
 
@@ -191,15 +190,15 @@ def _slope(point: _Point, w: Array, rest: Array) -> Array:
 
 
 def _free(s: Array, slope: Array) -> Array:
-    """Which numbers are not pushed against a bound."""
+    """Which components are not pushed against a bound."""
     return ~(((s <= 0) & (slope > 0)) | ((s >= 1) & (slope < 0)))
 
 
 def _step(
     point: _Point, curvature: Array, damping: Array, w: Array, rest: Array
 ) -> tuple[Array, Array]:
-    """A step to where the quadratic model is least on its way along the faces of the box, and the
-    descent it promises."""
+    """Step to the minimum of the quadratic model along the faces of the box, and the predicted
+    descent."""
     eye = jnp.eye(rest.size, dtype=rest.dtype)
     slope = _slope(point, w, rest)
     H = point.J.T @ point.J + (w**2 + damping) * eye
@@ -222,8 +221,8 @@ def _step(
 
 
 def _updated(S: Array, before: _Point, after: _Point) -> Array:
-    """S so that it tells how the slope has changed besides by $J^T J$; first made no greater than
-    what it is to tell."""
+    """Rank-one update of S, so that it gives the change of the slope beyond that of $J^T J$; S is
+    first scaled down to the size of that change."""
     move = after.s - before.s
     change = (after.J - before.J).T @ after.f
     told, there = jnp.abs(jnp.dot(move, S @ move)), jnp.abs(jnp.dot(move, change))

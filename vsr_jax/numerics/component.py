@@ -3,9 +3,8 @@
 A vector is a tuple of three arrays, a twist or a wrench a tuple of six (angular part first), a
 matrix a tuple of rows. All components share one shape: a scalar for a single cross-section,
 `(nodes,)` along an arm, with a batch axis in front under `jax.vmap` (the solver of loaded arms puts
-its batch last). Written this way the kernels are plain elementwise arithmetic, which XLA fuses into
-a few loops; small batched `dot_general`, `concatenate` and LAPACK calls, which it cannot fuse,
-never appear.
+its batch last). The kernels are then elementwise arithmetic, which XLA fuses into a few loops. It
+cannot fuse small batched `dot_general`, `concatenate` and LAPACK calls, so these are avoided.
 """
 
 import operator
@@ -28,15 +27,16 @@ Tree = TypeVar("Tree")
 def keep(tree: Tree, like: Array) -> Tree:
     """The same values, computed once.
 
-    XLA on CPU computes sums and products anew in each of their uses, but never a division: values
-    with many uses are divided by a one that it cannot know. `like` is any array of their shape.
+    XLA on CPU recomputes sums and products in each of their uses, but never a division. Values with
+    many uses are therefore divided by a one that is not a constant for the compiler. `like` is any
+    array of their shape.
     """
     one = jnp.where(jnp.isnan(like), jnp.nan, 1.0)
     return jax.tree.map(lambda x: x / one, tree)
 
 
 def single(tree: Tree) -> Tree:
-    """The same values in single precision; integers and truth values as they are."""
+    """The same values in single precision; integers and booleans are unchanged."""
     return cast(tree, jnp.float32)
 
 
@@ -61,6 +61,11 @@ def symmetric(lower: Matrix) -> Matrix:
     return tuple(tuple(lower[max(i, j)][min(i, j)] for j in range(size)) for i in range(size))
 
 
+def select(condition: Array, a: Tree, b: Tree) -> Tree:
+    """`a` where the condition holds and `b` elsewhere, component by component."""
+    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
+
+
 def add(a: Tree, b: Tree) -> Tree:
     """Sum $a + b$ of two vectors or two matrices, component by component."""
     return jax.tree.map(operator.add, a, b)
@@ -81,6 +86,11 @@ def scale(s: Array | float, a: Tree) -> Tree:
     return jax.tree.map(lambda x: s * x, a)
 
 
+def times(factor: Array | None, a: Tree) -> Tree:
+    """`scale`, where None stands for the factor 1 and costs no operation."""
+    return a if factor is None else scale(factor, a)
+
+
 def dot(a: Vector, b: Vector) -> Array:
     """Scalar product $a \\cdot b$."""
     total = a[0] * b[0]
@@ -90,7 +100,7 @@ def dot(a: Vector, b: Vector) -> Array:
 
 
 def norm(a: Vector) -> Array:
-    """Length $|a|$, with the derivative 0 at zero, where it has none."""
+    """Length $|a|$, with derivative 0 at $a = 0$."""
     square = dot(a, a)
     zero = square == 0
     return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, square)))

@@ -1,5 +1,5 @@
-"""A text that tells one computation from every other, so that kept results are taken up by the call
-that made them only."""
+"""A hash that identifies a computation, so that stored results are reused only by the same
+computation."""
 
 import hashlib
 import re
@@ -12,8 +12,8 @@ import numpy as np
 
 
 def fingerprint(function: Callable, arguments: Any, *more: Any) -> str:
-    """A hash of `function(*arguments)` as JAX sees it, and of all numbers in it, in the arguments
-    and in `more`."""
+    """Hash of the program of `function(*arguments)` and of all numbers in it, in the arguments and
+    in `more`."""
     arrays, static = eqx.partition((function, arguments), eqx.is_array)
 
     def run(arrays: Any) -> Any:

@@ -1,7 +1,8 @@
-"""What the implicit derivatives of all solvers share: tangents of what does not move are left out,
-those of truth values are empty."""
+"""Implicit derivatives of roots, shared by all solvers. Parameters that do not change are not
+differentiated."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -10,15 +11,66 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
 
-from .component import Tree
+from .newton import Root
+
+
+def implicit_root(
+    find: Callable[..., Root],
+    residual: Callable[..., Any],
+    solve: Callable[..., Any],
+    at_rest: Callable[..., tuple],
+    *parameters: Any,
+) -> Root:
+    r"""Root $x(p)$ of $r(x, p) = 0$ whose derivative is $dx = -(\partial r / \partial x)^{-1}
+    (\partial r / \partial p) \, dp$.
+
+    Derivatives of any order, in forward and reverse mode; the iteration is never differentiated. A
+    problem without a root has no derivative: its entries are replaced by those of `at_rest`, where
+    everything is finite, so that they do not affect the other problems of a batch.
+
+    **Arguments:** all but the parameters close over constants only.
+    - `find`: maps the parameters to a `Root`.
+    - `residual`: maps x and the parameters to r.
+    - `solve`: maps x, the parameters and a right side b to the solution y of $(\partial r /
+      \partial x) \, y = b$. Linear in b, so that JAX can transpose it.
+    - `at_rest`: maps x and the parameters to the same with finite values of all that may have
+      failed. A parameter that it returns unchanged costs no operation.
+    - `parameters`: pytrees of arrays.
+    """
+
+    @jax.custom_jvp
+    def root(*parameters: Any) -> Root:
+        return find(*parameters)
+
+    @partial(root.defjvp, symbolic_zeros=True)
+    def _(primals: tuple, tangents: tuple) -> tuple[Root, Root]:
+        found = root(*primals)
+        sound = found.converged & found.definite
+        rest_x, *rest = at_rest(found.x, *primals)
+        replaced = jax.tree.map(lambda p, p_rest: p is not p_rest, primals, tuple(rest))
+        x = jax.tree.map(partial(jnp.where, sound), found.x, rest_x)
+
+        def safe(parameters: tuple) -> tuple:
+            return jax.tree.map(
+                lambda replace, p, p_rest: jnp.where(sound, p, p_rest) if replace else p,
+                replaced,
+                parameters,
+                tuple(rest),
+            )
+
+        right = change_of(lambda *p: residual(x, *safe(p)), primals, tangents)
+        change = jax.tree.map(jnp.negative, solve(x, *safe(primals), right))
+        return found, Root(change, *no_derivative(found.converged, found.definite, found.steps))
+
+    return root(*parameters)
 
 
 def change_of(function: Callable, primals: tuple, tangents: tuple) -> Any:
-    """Derivative of a function along tangents of which some are symbolic zeros: by those it is not
-    differentiated at all.
+    """Derivative of a function along tangents. By primals whose tangent is a symbolic zero it is
+    not differentiated.
 
-    A scene has dozens of numbers; mostly a few of them move, and the rest would double the program
-    for nothing.
+    A scene has dozens of numbers. Usually only a few of them change, and differentiating by the
+    others would double the program.
     """
     leaves, tree = jax.tree.flatten(primals)
     rates = jax.tree.leaves(tangents)
@@ -31,15 +83,6 @@ def change_of(function: Callable, primals: tuple, tangents: tuple) -> Any:
         )
 
     return jax.jvp(moved, tuple(leaves[i] for i in moving), tuple(rates[i] for i in moving))[1]
-
-
-def instantiated(tangents: Tree, primals: Tree) -> Tree:
-    """Tangents with arrays of zeros for symbolic ones."""
-    return jax.tree.map(
-        lambda rate, x: jnp.zeros_like(x) if isinstance(rate, SymbolicZero) else rate,
-        tangents,
-        primals,
-    )
 
 
 def no_derivative(*values: Array) -> tuple[Any, ...]:

@@ -1,12 +1,12 @@
-r"""Least and greatest eigenvalue of a symmetric operator that is known by its products, by Lanczos'
-method.
+r"""Smallest and largest eigenvalue of a symmetric operator, from its products with vectors, by the
+Lanczos method.
 
 From a start $v_1$ the recurrence $\beta_j v_{j+1} = S v_j - \alpha_j v_j - \beta_{j-1} v_{j-1}$
 builds an orthonormal basis $V$ in which S is the tridiagonal matrix $T = V^T S V$. The ends of its
 spectrum approach those of S first. With $T s = \theta s$ the pair $(\theta, V s)$ leaves the
 residual $|S V s - \theta V s| = \beta_m |s_m|$, which bounds the distance of $\theta$ to an
-eigenvalue of S. Every new vector is made orthogonal to all before it. There is no call of LAPACK,
-so that any number of operators can go side by side.
+eigenvalue of S. Every new vector is orthogonalised against all earlier ones. LAPACK is not called,
+so that any number of operators can be batched.
 """
 
 from abc import abstractmethod
@@ -24,19 +24,20 @@ from jaxtyping import Array, Float
 from .implicit import change_of
 
 _MOST = 256
-"""Bound on the number of products, or a quarter of the unknowns: arms take twenty to eighty, and
-more where an end of the spectrum is the edge of a band that the sections' own tangents fill."""
+"""Bound on the number of products, or a quarter of the unknowns if that is more. Arms take 20 to
+80, and more where an end of the spectrum is the edge of the band of the sections' own tangents."""
 
 _BETWEEN = 8
-"""Products from one look at the spectrum of T to the next."""
+"""Products between two computations of the spectrum of T."""
 
 _SECTIONS = 256
-"""Parts into which an interval with an eigenvalue is cut at a time: 8 bits of it."""
+"""Parts into which an interval with an eigenvalue is divided at a time, which gives 8 bits of
+it."""
 
 
 class Operator(eqx.Module):
-    """A symmetric operator on arrays of one shape. Its eigenpairs can be differentiated by the
-    arrays it is made of."""
+    """A symmetric operator on arrays of one shape. Its eigenpairs can be differentiated by its
+    arrays."""
 
     @property
     @abstractmethod
@@ -45,24 +46,24 @@ class Operator(eqx.Module):
 
     @abstractmethod
     def times(self, v: Array) -> Array:
-        """$S v$, in the allowed space and zero for all that is orthogonal to it."""
+        """$S v$, in the allowed space; zero for vectors orthogonal to it."""
 
     @abstractmethod
     def allowed(self, v: Array) -> Array:
-        """Orthogonal projection onto the space where eigenvalues are looked for."""
+        """Orthogonal projection onto the space of the eigenvectors that are sought."""
 
 
 class Pairs(NamedTuple):
-    """Least and greatest eigenvalue, shape (2,), with their unit eigenvectors, shape (2, ...); NaN
-    where they were not found."""
+    """Smallest and largest eigenvalue, shape (2,), with their unit eigenvectors, shape (2, ...);
+    NaN where not found."""
 
     values: Float[Array, "2"]
     vectors: Float[Array, "2 *shape"]
 
 
-class _Basis(NamedTuple):
-    """Lanczos vectors in rows, T by diagonal and subdiagonal, the next vector, how many there are;
-    the ends of the spectrum of T, their vectors in the basis and residuals."""
+class _KrylovBasis(NamedTuple):
+    """Lanczos vectors in rows, diagonal and subdiagonal of T, the next vector, the number of
+    vectors; the ends of the spectrum of T, their vectors in the basis and residuals."""
 
     rows: Array
     alpha: Array
@@ -78,25 +79,25 @@ class _Basis(NamedTuple):
 def extreme_pairs(operator: Operator) -> Pairs:
     r"""Ends of the spectrum of a symmetric operator.
 
-    Residuals come down to $\epsilon^{0.6}$ for the least, times its size where that is greater than
-    1, and $\epsilon^{0.4}$ for the greatest; a least one whose residual stays above
-    $\epsilon^{0.5}$ is not given. Derivatives are exact, of any order: $d\lambda = v^T dS\, v$ and
-    $(S - \lambda)\, dv = -(dS - d\lambda) v$ by conjugate gradients. Where an eigenvalue is
-    multiple it has no derivative, and what is returned is that along one of its vectors.
+    Residuals reach $\epsilon^{0.6}$ for the smallest eigenvalue and $\epsilon^{0.4}$ for the
+    largest, relative where the eigenvalue is above 1 in size. A smallest one whose residual stays
+    above $\epsilon^{0.5}$ is NaN. Derivatives are exact, of any order: $d\lambda = v^T dS\, v$ and
+    $(S - \lambda)\, dv = -(dS - d\lambda) v$ by conjugate gradients. A multiple eigenvalue has no
+    derivative; the result is the derivative along one of its eigenvectors.
     """
     start = np.random.default_rng(0).standard_normal(operator.like.shape)
     start = operator.allowed(jnp.asarray(start, operator.like.dtype))
     eps = float(jnp.finfo(start.dtype).eps)
 
-    def unsettled(basis: _Basis, least: float, greatest: float) -> Array:
+    def unsettled(basis: _KrylovBasis, least: float, greatest: float) -> Array:
         return basis.residual > jnp.array([least, greatest], start.dtype) * jnp.maximum(
             1, jnp.abs(basis.values)
         )
 
-    def proceed(basis: _Basis) -> Array:
+    def proceed(basis: _KrylovBasis) -> Array:
         return (basis.filled < basis.alpha.size) & jnp.any(unsettled(basis, eps**0.6, eps**0.4))
 
-    def extend(basis: _Basis) -> _Basis:
+    def extend(basis: _KrylovBasis) -> _KrylovBasis:
         return _with_ritz(
             lax.fori_loop(0, _BETWEEN, lambda _, basis: _one_more(operator, basis), basis)
         )
@@ -110,12 +111,12 @@ def extreme_pairs(operator: Operator) -> Pairs:
     )
 
 
-def _empty(start: Array) -> _Basis:
+def _empty(start: Array) -> _KrylovBasis:
     size = -(-min(start.size, max(_MOST, start.size // 4)) // _BETWEEN) * _BETWEEN
     flat = start.reshape(-1)
     zero, two = jnp.zeros(size, flat.dtype), jnp.zeros(2, flat.dtype)
     unit = flat / jnp.sqrt(jnp.sum(flat**2))
-    return _Basis(
+    return _KrylovBasis(
         jnp.zeros((size, flat.size), flat.dtype),
         zero,
         zero,
@@ -127,16 +128,16 @@ def _empty(start: Array) -> _Basis:
     )
 
 
-def _one_more(operator: Operator, basis: _Basis) -> _Basis:
-    """One product. Once the basis spans an invariant space the vectors are zero, and T goes on with
-    an entry from inside its spectrum."""
+def _one_more(operator: Operator, basis: _KrylovBasis) -> _KrylovBasis:
+    """Add one vector. Once the basis spans an invariant space, further vectors are zero and T is
+    padded with an entry from inside its spectrum."""
     v, j = basis.following, basis.filled
     rows = basis.rows.at[j].set(v)
     w = operator.times(v.reshape(operator.like.shape)).reshape(-1)
     parts = rows @ w
     w = operator.allowed((w - parts @ rows).reshape(operator.like.shape)).reshape(
         -1
-    )  # what rounding brings of the rest would grow
+    )  # rounding errors outside the allowed space would grow
     w = w - (rows @ w) @ rows
     size = jnp.sqrt(jnp.sum(w**2))
     alpha = basis.alpha.at[j].set(jnp.where(jnp.any(v != 0), parts[j], basis.alpha[0]))
@@ -146,7 +147,7 @@ def _one_more(operator: Operator, basis: _Basis) -> _Basis:
     return basis._replace(rows=rows, alpha=alpha, beta=beta, following=following, filled=j + 1)
 
 
-def _with_ritz(basis: _Basis) -> _Basis:
+def _with_ritz(basis: _KrylovBasis) -> _KrylovBasis:
     """The ends of the spectrum of T, with their vectors and residuals."""
     filled = jnp.arange(basis.alpha.size) < basis.filled
     alpha = jnp.where(
@@ -172,20 +173,19 @@ def _pivots(alpha: Array, link: Array, x: Array) -> Array:
 
 
 def _pivot(diagonal: Array, link: Array, last: Array) -> Array:
-    """The next pivot, and not zero."""
+    """The next pivot, never zero."""
     least = jnp.finfo(last.dtype).tiny ** 0.5
     d = diagonal - link**2 / last
     return jnp.where(jnp.abs(d) < least, -least, d)
 
 
 def _shifted(link: Array) -> Array:
-    """Links to the row before in place of those to the next."""
+    """Subdiagonal entries indexed by their lower row instead of their upper one."""
     return jnp.concatenate([jnp.zeros_like(link[:1]), link[:-1]])
 
 
 def _ends(alpha: Array, link: Array, count: Array) -> Array:
-    """Least and greatest eigenvalue of T, by counting the negative pivots at many places at
-    once."""
+    """Smallest and largest eigenvalue of T, by multisection with counts of negative pivots."""
     before = _shifted(link)
     reach = jnp.abs(link) + before
     low, high = jnp.min(alpha - reach), jnp.max(alpha + reach)
@@ -227,8 +227,8 @@ def _vector(alpha: Array, link: Array, x: Array) -> Array:
 
 
 def _solve(operator: Operator, value: Array, v: Array, sign: float, right: Array) -> Array:
-    r"""Solution of $(S - \lambda) x = b$ orthogonal to v in the allowed space, with b projected on
-    that; NaN where it is not found."""
+    r"""Solution of $(S - \lambda) x = b$ orthogonal to v in the allowed space, with b projected
+    onto it; NaN where not found."""
 
     def project(x: Array) -> Array:
         x = operator.allowed(x)

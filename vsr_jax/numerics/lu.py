@@ -1,9 +1,8 @@
 r"""Small dense systems, $A = L U$ without pivots, in plain array operations.
 
-For matrices whose leading minors are positive, as those of a stable arm are, no pivots are needed,
-and the diagonal of U tells whether they are. Many systems may lie side by side in the last axes,
-and several such solves may stand in one program: LAPACK's batched routines block each other there
-(jaxlib 0.10.2, two cores).
+A matrix whose leading minors are positive, as for a stable arm, needs no pivoting; the diagonal of
+U is positive exactly then. The last axes may hold a batch of systems. LAPACK is avoided: two of its
+batched routines in one program can block each other (jaxlib 0.10.2, two cores).
 """
 
 import jax.numpy as jnp
@@ -12,7 +11,8 @@ from jaxtyping import Array, Float
 
 
 def factor(matrix: Float[Array, "n n *#arms"]) -> Float[Array, "n n *#arms"]:
-    """Factors of a matrix in one: U on and above the diagonal, L below it without its ones."""
+    """Both factors in one matrix: U on and above the diagonal, L without its unit diagonal below
+    it."""
     place = jnp.arange(matrix.shape[0]).reshape(-1, *(1,) * (matrix.ndim - 2))
 
     def eliminate(k: Array, A: Array) -> Array:

@@ -17,10 +17,20 @@ from ..typing import Pose, Scalar, Twist
 from ..validation import choice
 from . import component as c
 from .component import Matrix, Vector
-from .se3 import adjoint, bracket_components, compose_components, exp, exp_components, inverse, pose
+from .se3 import (
+    adjoint,
+    base_pose,
+    bracket_components,
+    compose_components,
+    exp,
+    exp_components,
+    inverse,
+    pose,
+    vee,
+)
 
 ORDERS = (2, 4, 6)
-"""Orders of the steps; order 2 s uses s Gauss points a step."""
+"""Orders of the steps; order 2 s uses s Gauss points per step."""
 
 
 def step_components(stages: tuple[Vector, ...], h: Array) -> Vector:
@@ -68,7 +78,7 @@ def step_twist(strains: Float[Array, "stages 6"], h: Scalar) -> Twist:
     **Raises:** `ValueError` for another number of Gauss points.
 
     **Source:** Blanes, Casas, Oteo and Ros, The Magnus expansion, Physics Reports 470 (2009), eq.
-    (254) ff., with the brackets turned over for $g' = g \hat\xi$.
+    (254) ff., with the brackets reversed for $g' = g \hat\xi$.
     """
     choice("strains.shape[0]", strains.shape[0], (1, 2, 3))
     return jnp.stack(step_components(tuple(c.split(xi) for xi in strains), h))
@@ -95,10 +105,8 @@ def zanna_step(xi_1: Twist, xi_2: Twist, h: Scalar) -> Twist:
 def base_components(base: Pose | None, like: Array) -> tuple[Matrix, Vector]:
     """Rotation and position of the base as components of `like`'s shape and dtype; the identity for
     None."""
-    matrix = jnp.eye(4, dtype=like.dtype) if base is None else base
-    rows = tuple(
-        tuple(jnp.broadcast_to(x, like.shape) for x in c.split(matrix[i])) for i in range(3)
-    )
+    matrix = base_pose(base, like.dtype)
+    rows = tuple(tuple(jnp.broadcast_to(x, like.shape) for x in row) for row in matrix[:3])
     return tuple(row[:3] for row in rows), tuple(row[3] for row in rows)
 
 
@@ -144,7 +152,7 @@ def step_poses(
 def step_jacobian(
     strains: Float[Array, "stages 6"], rates: Float[Array, "stages 6 dofs"], h: Scalar
 ) -> Float[Array, "6 dofs"]:
-    r"""Body twist $(g^{-1} \delta g)^\vee$ of one step's motion per change of the coordinates.
+    r"""Body twist $(g^{-1} \delta g)^\vee$ of one step per change of the coordinates.
 
     **Arguments:** `strains` at the step's Gauss points, `rates` $= \partial \xi / \partial q$
     there, `h` [m].
@@ -155,8 +163,7 @@ def step_jacobian(
 
     def column(rate: Float[Array, "stages 6"]) -> Twist:
         g, rate_of_g = jax.jvp(lambda xi: exp(step_twist(xi, h)), (strains,), (rate,))
-        m = inverse(g) @ rate_of_g
-        return jnp.stack([m[2, 1], m[0, 2], m[1, 0], m[0, 3], m[1, 3], m[2, 3]])
+        return vee(inverse(g) @ rate_of_g)
 
     return jax.vmap(column, in_axes=-1, out_axes=-1)(rates)
 

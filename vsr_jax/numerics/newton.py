@@ -1,4 +1,4 @@
-"""Newton's method with a guarded step, for one vector or for many small problems side by side in
+"""Newton's method with a safeguarded step, for one vector or for a batch of small problems in
 component arrays."""
 
 from collections.abc import Callable
@@ -9,28 +9,42 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from .component import Tree
+from .component import select
 
 MAX_STEPS = 50
+"""Bound on the evaluations of `newton`; the cases of the paper take 1 to 5."""
 MAX_DAMPED_STEPS = 200
+"""Bound on the evaluations of `damped_newton`; heavy soft arms take 22 to 45."""
 MAX_PLAIN_STEPS = 25
-LOAD_SHARES = 5
-MOST_TURN = 1.5
-"""Bound on how far [rad] one step of a loaded solve may turn the arm: one that coils it may lower
-the residual, and lead nowhere."""
-_LEAST_FRACTION = 1e-6
+"""Bound on the plain Newton steps that follow where damping has failed."""
+LOAD_INCREMENTS = 5
+"""Increments in which `damped_newton` applies the loads: with all loads at once the tangent is
+often indefinite at the start."""
+MAX_TURN = 1.5
+"""Bound on the angle [rad] by which one step of a loaded solve bends and twists the arm. A step
+that coils the arm may lower the residual without approaching a solution."""
+_MIN_FRACTION = 1e-6
+"""Fraction of a step below which `newton` gives up: ten cuts to a quarter."""
 _FAST = 1e-4
-_LEAST_DAMPING, _MOST_DAMPING = 0.1, 1e8
+"""Ratio of successive steps below which convergence is quadratic: a step may then be larger when
+`newton` ends."""
+_MIN_DAMPING, _MAX_DAMPING = 0.1, 1e8
+"""First damping above zero, and the damping at which plain Newton steps take over."""
 _RAISE, _LOWER = 10.0, 30.0
-_LEAST_LEFT, _MOST_LEFT = 0.25, 0.99
+"""Factor by which damping rises after a rejected step, and divisor after an accepted one."""
+_MIN_CONTRACTION, _MAX_CONTRACTION = 0.25, 0.99
+"""Contraction of the residual above which a step is extrapolated, and the largest that is used: it
+bounds the extrapolation to 98 steps."""
 _ACCEPTED = 64
-_MOST_RISES = 3
+"""Largest accepted residual, in multiples of its rounding level."""
+_MAX_RISES = 3
+"""Rises of an accepted residual after which it is taken to be at rounding level."""
 
 
 class Evaluation(NamedTuple):
-    """What Newton's method learns at a point: the step to subtract, its size, the size of the
-    residual, and whether the tangent is positive definite there. The sizes have no unit and the
-    shape of one problem per entry."""
+    """Evaluation of one point for `newton`: the step to subtract, its size, the size of the
+    residual, and whether the tangent is positive definite. The sizes are dimensionless, with one
+    entry per problem."""
 
     step: Any
     size: Array
@@ -38,23 +52,33 @@ class Evaluation(NamedTuple):
     definite: Array
 
 
-class Root(NamedTuple):
-    """Where Newton's method ended: the point, whether the last tangent was positive definite, and
-    the steps taken."""
+class Iterate(NamedTuple):
+    """Where `newton` ended: the point, whether the last tangent was positive definite, and the
+    number of steps."""
 
     x: Any
     definite: Array
     steps: Array
 
 
-def newton(evaluate: Callable[[Any], Evaluation], start: Any, floor: Array) -> Root:
+class Root(NamedTuple):
+    """Result of a root search: the point, whether the residual vanishes there, whether the tangent
+    is positive definite there, and the number of evaluations."""
+
+    x: Any
+    converged: Array
+    definite: Array
+    steps: Array
+
+
+def newton(evaluate: Callable[[Any], Evaluation], start: Any, floor: Array) -> Iterate:
     """Root of a residual from `start`.
 
     A step that does not lower the residual's size is cut to a quarter and tried again. The loop
-    ends when the next step of every problem is so small that its own quadratic error is below
-    rounding (that step is still taken; a greater one will do where steps shrink fast), when the
-    fraction of a step has become negligible, or after 50 evaluations. The caller decides from the
-    residual at the end what was reached.
+    ends when the next step of every problem is so small that its quadratic error is below rounding
+    (that step is still taken; the bound is larger where steps shrink fast), when the fraction of a
+    step is negligible, or after `MAX_STEPS` evaluations. The caller judges the result from the
+    residual there.
 
     **Arguments:**
     - `evaluate`: maps a point, a pytree of arrays, to its `Evaluation`.
@@ -66,7 +90,7 @@ def newton(evaluate: Callable[[Any], Evaluation], start: Any, floor: Array) -> R
 
     def proceed(state: tuple) -> Array:
         _, at, fraction, enough, count = state
-        pending = ((at.size > enough) | jnp.isinf(at.merit)) & (fraction > _LEAST_FRACTION)
+        pending = ((at.size > enough) | jnp.isinf(at.merit)) & (fraction > _MIN_FRACTION)
         return (count < MAX_STEPS) & jnp.any(pending)
 
     def advance(state: tuple) -> tuple:
@@ -75,19 +99,19 @@ def newton(evaluate: Callable[[Any], Evaluation], start: Any, floor: Array) -> R
         new = evaluate(trial)
         better = (new.merit < at.merit) | (new.merit < floor)
         enough = jnp.where(better & (new.size < _FAST * at.size), small, smaller)
-        x, at = _where(better, (trial, new), (x, at))
+        x, at = select(better, (trial, new), (x, at))
         return x, at, jnp.where(better, jnp.ones_like(fraction), fraction / 4), enough, count + 1
 
     still = jax.tree.map(jnp.zeros_like, start)
     first = Evaluation(still, jnp.zeros_like(merit), merit, jnp.ones(merit.shape, bool))
     begin = (start, first, jnp.ones_like(merit), jnp.zeros_like(merit), jnp.zeros((), jnp.int32))
     x, at, _, _, count = lax.while_loop(proceed, advance, begin)
-    return Root(jax.tree.map(jnp.subtract, x, at.step), at.definite, count)
+    return Iterate(jax.tree.map(jnp.subtract, x, at.step), at.definite, count)
 
 
 class Damped(NamedTuple):
-    """What `damped_newton` learns at a point for one damping: the step to subtract, its size, the
-    residual, its size, and whether the damped tangent is positive definite there."""
+    """Evaluation of one point and one damping for `damped_newton`: the step to subtract, its size,
+    the residual, its size, and whether the damped tangent is positive definite."""
 
     step: Any
     size: Array
@@ -96,76 +120,67 @@ class Damped(NamedTuple):
     definite: Array
 
 
-class Solution(NamedTuple):
-    """The unknowns, whether they balance, whether the tangent is positive definite there, and the
-    evaluations taken."""
-
-    unknown: Any
-    balanced: Array
-    definite: Array
-    steps: Array
-
-
 def damped_newton(
     evaluate: Callable[[Any, Array, Array], Damped],
     work: Callable[[Any, Any], Array],
     start: Any,
     floor: Array,
-    shares: int = 1,
-) -> Solution:
+    increments: int = 1,
+) -> Root:
     r"""Root of a residual that is the gradient of an energy, or nearly so, by Newton's method with
-    Levenberg's damping.
+    Levenberg damping.
 
-    The tangent is $H + \mu \Sigma$: a short step in implicit time of an arm that creeps. $\mu$
-    rises until the tangent is positive definite, and falls with every step taken. A step is taken
-    if the residual does not push back over it more than it pulled, $r(x + s) \cdot s \le -r(x)
-    \cdot s$, so that the energy falls, or if the residual has become smaller. The loads come in
-    equal shares, one more with every step taken until all are there, and such a step is always
-    taken: what matters of the way is only where it leads. All at once they often make the tangent
-    indefinite at the start. The tangent may be approximate. Where it is much too stiff for a soft
-    motion of the arm, what is left of the residual along a full step is a share $\rho$ near 1, and
-    the steps shrink by it alone: so the next takes $\rho^2 / (1 - \rho)$ of the last step with it,
-    the rest of the geometric series.
+    The tangent is $H + \mu \Sigma$: an implicit time step of a creeping arm. $\mu$ rises until the
+    tangent is positive definite and falls with every accepted step.
 
-    The end is reached where the residual is one that is accepted, the step is undamped, and either
-    the step is negligible together with those that would follow it, $1 / (1 - \rho)$ of it, or the
-    residual has risen three times: rounding. Nothing that would be refused ends the loop before its
-    bounds do. A problem that meets the bound on its evaluations or on $\mu$ gets some plain Newton
-    steps from where it is: these end in an equilibrium that is not stable where there is one
-    nearby. The last step is never taken, so that the residual returned is that of the point
-    returned. Problems may be solved together, in the last axes of all arrays: each takes its own
-    steps and stands still when it is done.
+    - Acceptance. A step is accepted if the energy falls along it, $r(x - s) \cdot s \ge -r(x) \cdot
+      s$ for the step s that is subtracted, or if the residual becomes smaller.
+    - Load increments. The loads are applied in equal increments, one per accepted step. Steps are
+      always accepted until all loads are applied.
+    - Extrapolation. The tangent may be approximate. Where it is much too stiff for a soft motion of
+      the arm, the residual along a full step contracts only by $\rho$ near 1. The next step then
+      includes $\rho^2 / (1 - \rho)$ of the last one, the remainder of the geometric series.
+
+    The iteration ends where the residual is accepted, the step is undamped, and either the step
+    times $1 / (1 - \rho)$, the sum of all steps to come, is negligible, or the residual has risen
+    three times, which is rounding. A residual that is not accepted never ends the iteration before
+    its bounds do. A problem that reaches the bound on its evaluations or on $\mu$ gets some plain
+    Newton steps, which find an unstable equilibrium if one is near. The last step is not taken, so
+    that the returned residual is that of the returned point. Several problems can be solved
+    together, in the last axes of all arrays; each stops when it is done.
 
     **Arguments:**
-    - `evaluate`: maps a point, a damping $\mu$ and the share of the loads to `Damped`.
+    - `evaluate`: maps a point, a damping $\mu$ and the fraction of the loads to `Damped`.
     - `work`: scalar product of a residual and a step.
-    - `floor`: size of the residual that counts as rounding, of the shape of the problems side by
-      side.
+    - `floor`: size of the residual that counts as rounding, one entry per problem.
+    - `increments`: number of load increments.
 
-    **Returns:** a `Solution`; it balances if the residual at the end is rounding or as small as a
+    **Returns:** a `Root`; it is converged if the residual at the end is rounding or as small as a
     negligible step.
     """
     small = jnp.finfo(floor.dtype).eps ** 0.75
     accepted = jnp.maximum(_ACCEPTED * floor, small)
 
     def pending(guard: _Guard) -> Array:
-        negligible = (guard.miss < small) | (guard.rises >= _MOST_RISES)
+        negligible = (guard.miss < small) | (guard.rises >= _MAX_RISES)
         done = guard.fresh & (guard.damping == 0) & (guard.merit <= accepted) & negligible
         stuck = ~guard.definite & (guard.merit < floor)
-        return ~((done | stuck) & (guard.given == shares)) & (guard.plain < MAX_PLAIN_STEPS)
+        return ~((done | stuck) & (guard.applied == increments)) & (guard.plain < MAX_PLAIN_STEPS)
 
     def advance(state: tuple) -> tuple:
         x, step, old = state
-        plain = (old.spent >= MAX_DAMPED_STEPS) | (old.damping >= _MOST_DAMPING) | (old.plain > 0)
+        plain = (old.spent >= MAX_DAMPED_STEPS) | (old.damping >= _MAX_DAMPING) | (old.plain > 0)
         trial = jax.tree.map(lambda a, s: jnp.where(old.fresh, a - s.astype(a.dtype), a), x, step)
         damping = jnp.where(plain, 0.0, jnp.where(old.fresh, _lowered(old.damping), old.damping))
-        given = jnp.where(
-            plain, shares, jnp.where(old.fresh, jnp.minimum(old.given + 1, shares), old.given)
+        applied = jnp.where(
+            plain,
+            increments,
+            jnp.where(old.fresh, jnp.minimum(old.applied + 1, increments), old.applied),
         )
-        new = evaluate(trial, damping, given / shares)
+        new = evaluate(trial, damping, applied / increments)
         left = work(new.residual, step)
         better = (
-            (old.given < shares)
+            (old.applied < increments)
             | (left >= -old.pull)
             | (new.merit < old.merit)
             | (new.merit < floor)
@@ -175,45 +190,45 @@ def damped_newton(
         damping = jnp.where(
             taken & (new.definite | plain), damping, _raised(jnp.where(taken, damping, old.damping))
         )
-        whole = (old.damping == 0) & (damping == 0) & old.fresh & (old.given == shares)
+        whole = (old.damping == 0) & (damping == 0) & old.fresh & (old.applied == increments)
         more = _extrapolated(
             whole & (new.merit > 4 * floor), jnp.minimum(left / old.pull, new.size / old.size)
         )
         new = new._replace(
             step=jax.tree.map(lambda s, last: s + more.astype(s.dtype) * last, new.step, step)
         )
-        share = jnp.where(whole, jnp.clip(new.size / old.size, 0.0, _MOST_LEFT), 0.0)
+        rho = jnp.where(whole, jnp.clip(new.size / old.size, 0.0, _MAX_CONTRACTION), 0.0)
         rises = old.rises + (whole & (old.merit <= accepted) & (new.merit >= old.merit)).astype(
             jnp.int32
         )
         there = _Guard(
             new.size,
-            new.size / (1 - share),
+            new.size / (1 - rho),
             new.merit,
             new.definite,
             work(new.residual, new.step),
             damping,
-            given,
+            applied,
             new.definite | plain,
             rises,
             old.spent,
             old.plain,
         )
         here = old._replace(damping=damping, fresh=plain)
-        guard = _where(taken, there, here)._replace(
+        guard = select(taken, there, here)._replace(
             spent=old.spent + 1, plain=old.plain + plain.astype(jnp.int32)
         )
-        # a step that is not taken is computed again with more damping before it is used, and that
-        # of a problem that is done never is
+        # a rejected step is computed again with more damping before it is used; that of a problem
+        # that is done is never used
         go = pending(old)
-        return _where(go & taken, trial, x), new.step, _where(go, guard, old)
+        return select(go & taken, trial, x), new.step, select(go, guard, old)
 
     zero, no, none = (
         jnp.zeros_like(floor),
         jnp.zeros(floor.shape, bool),
         jnp.zeros(floor.shape, jnp.int32),
     )
-    damping = jnp.full_like(floor, _LEAST_DAMPING if shares == 1 else 0.0)
+    damping = jnp.full_like(floor, _MIN_DAMPING if increments == 1 else 0.0)
     guard = _Guard(zero, zero, zero + jnp.inf, ~no, zero, damping, zero + 1, no, none, none, none)
     step = jax.tree.map(
         lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
@@ -222,15 +237,15 @@ def damped_newton(
     x, _, guard = lax.while_loop(
         lambda state: jnp.any(pending(state[2])), advance, (start, step, guard)
     )
-    return Solution(x, guard.merit <= accepted, guard.definite, guard.spent)
+    return Root(x, guard.merit <= accepted, guard.definite, guard.spent)
 
 
 class _Guard(NamedTuple):
-    """What `damped_newton` keeps of each problem besides the point and the step: size of the step,
-    what is missed without it and those that would follow, size of the residual, whether the tangent
-    is definite, the work of the residual over the step; damping, shares of the loads so far,
-    whether the step may be tried, how often an undamped step raised a residual that is accepted,
-    evaluations so far, and the plain ones of them."""
+    """State of each problem in `damped_newton` besides the point and the step: size of the step and
+    of the sum of all steps to come, size of the residual, whether the tangent is definite, the work
+    of the residual over the step; damping, load increments applied, whether the step may be tried,
+    how often an undamped step raised an accepted residual, and the number of evaluations and of
+    plain Newton steps."""
 
     size: Array
     miss: Array
@@ -238,7 +253,7 @@ class _Guard(NamedTuple):
     definite: Array
     pull: Array
     damping: Array
-    given: Array
+    applied: Array
     fresh: Array
     rises: Array
     spent: Array
@@ -246,19 +261,15 @@ class _Guard(NamedTuple):
 
 
 def _extrapolated(wanted: Array, left: Array) -> Array:
-    """How much of the last step to take again where wanted, from the share of the residual that it
-    left along itself."""
-    share = jnp.clip(left, 0.0, _MOST_LEFT)
-    return jnp.where(wanted & (share > _LEAST_LEFT), share**2 / (1 - share), 0.0)
+    """Fraction of the last step to take again where wanted, from the contraction of the residual
+    along it."""
+    rho = jnp.clip(left, 0.0, _MAX_CONTRACTION)
+    return jnp.where(wanted & (rho > _MIN_CONTRACTION), rho**2 / (1 - rho), 0.0)
 
 
 def _raised(damping: Array) -> Array:
-    return jnp.maximum(_RAISE * damping, _LEAST_DAMPING)
+    return jnp.maximum(_RAISE * damping, _MIN_DAMPING)
 
 
 def _lowered(damping: Array) -> Array:
-    return jnp.where(damping > 1e-2 * _LEAST_DAMPING, damping / _LOWER, 0.0)
-
-
-def _where(condition: Array, a: Tree, b: Tree) -> Tree:
-    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
+    return jnp.where(damping > 1e-2 * _MIN_DAMPING, damping / _LOWER, 0.0)

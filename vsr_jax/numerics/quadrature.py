@@ -35,8 +35,8 @@ def gauss_legendre(stages: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def piece_edges(length: Scalar, breakpoints: tuple[Scalar, ...]) -> Float[Array, " edges"]:
-    """Ends of the pieces of [0, L], rising; breakpoints beyond the arm make empty pieces at its
-    ends."""
+    """Ends of the pieces of [0, L] in ascending order; breakpoints beyond the arm make empty pieces
+    at its ends."""
     inner = [jnp.clip(point, 0, length) for point in breakpoints]
     return jnp.sort(jnp.stack([jnp.zeros_like(length), *inner, length]))
 
@@ -46,15 +46,16 @@ def make_grid(
 ) -> Grid:
     """Grid of `steps` steps with `stages` nodes each.
 
-    Every piece between `edges` has at least one step, an empty piece too, so that a derivative sees
-    it open; the other steps are shared by the lengths of the pieces. Where `steps` is traced,
-    `room` says how many there may be: those that are not wanted are empty, at the end of the arm.
+    Every piece between `edges` has at least one step, also an empty piece, whose derivative by its
+    length is then right; the other steps are distributed by the lengths of the pieces. Where
+    `steps` is traced, `room` is the largest number: the steps beyond `steps` are empty and lie at
+    the end of the arm.
     """
     least = edges.size - 1
     place = np.arange(max(int(steps) if room is None else room, least))
     wanted = max(int(steps), least) if room is None else jnp.maximum(steps, least)
     piece, count, at = (
-        (0, wanted, place) if least == 1 else _share(edges, wanted, jnp.asarray(place))
+        (0, wanted, place) if least == 1 else _distributed(edges, wanted, jnp.asarray(place))
     )
     width = jnp.broadcast_to(jnp.diff(edges)[piece] / count, place.shape)
     start = edges[:-1][piece] + at.astype(width.dtype) * width
@@ -65,11 +66,11 @@ def make_grid(
     return Grid(start, width, start + nodes[:, None] * width, jnp.asarray(weights[:, None] * width))
 
 
-def _share(
+def _distributed(
     edges: Float[Array, " edges"], steps: int | Array, place: Array
 ) -> tuple[Array, Array, Array]:
-    """For each step its piece, the number of steps of that piece and its place among them; largest
-    remainders get more."""
+    """For each step its piece, the number of steps of that piece and its place among them, by the
+    largest-remainder method."""
     lengths = jnp.diff(edges)
     exact = (steps - lengths.size) * lengths / jnp.sum(lengths)
     whole = jnp.floor(exact)
@@ -88,16 +89,16 @@ def interpolation(stages: int) -> np.ndarray:
 
 
 def merging(stages: int) -> np.ndarray:
-    """Weights that carry values at the Gauss nodes of two equal steps, of the first and then of the
-    second, to those of one step of both by the polynomial through all of them; shape (stages, 2
-    stages)."""
+    """Weights of the interpolation from the Gauss nodes of two equal steps, first those of the
+    first step, to the nodes of the merged step, by the polynomial through all of them; shape
+    (stages, 2 stages)."""
     nodes = gauss_legendre(stages)[0]
     through = np.linalg.inv(np.vander(np.concatenate([nodes, nodes + 1]) / 2, increasing=True))
     return np.vander(nodes, 2 * stages, increasing=True) @ through
 
 
 def weighted(weights: np.ndarray, values: Array) -> Array:
-    """Sum of the values at the nodes of a step, each with its weight."""
+    """Weighted sum of the values at the nodes of a step."""
     total = float(weights[0]) * values[0]
     for i in range(1, len(weights)):
         total = total + float(weights[i]) * values[i]
@@ -108,8 +109,7 @@ def beyond(density: Vector, grid: Grid) -> Vector:
     r"""Integral from each node to the end of the arm, $\int_X^L q \, ds$: exact for q of degree
     `stages - 1` in each step.
 
-    **Arguments:** `density`: component arrays $q$ at the nodes, shape (stages, steps) and that of
-    the arms side by side.
+    **Arguments:** `density`: component arrays $q$ at the nodes, shape (stages, steps, *arms).
     """
     stages = grid.X.shape[0]
     nodes, weights = gauss_legendre(stages)
@@ -130,16 +130,18 @@ def beyond(density: Vector, grid: Grid) -> Vector:
 
 
 def locate(grid: Grid, X: Array) -> tuple[Array, Array]:
-    """Step in which each abscissa lies and the fraction of the step before it."""
+    """Step in which each abscissa lies, and its place in the step as a fraction."""
     step = jnp.clip(jnp.searchsorted(grid.start, X, side="right") - 1, 0, grid.start.size - 1)
     h = grid.h[step]
     return step, jnp.where(h > 0, (X - grid.start[step]) / jnp.where(h > 0, h, 1.0), 0.0)
 
 
 def onto(X: Array, start: Array | float, end: Array | float, slack: Array) -> tuple[Array, Array]:
-    """Abscissas clipped to [start, end], and whether they lie there or beyond it by `slack` at
-    most. Those farther away become `start`, so that what is computed from them is finite; the
-    derivative of the others is 1."""
+    """Abscissas clipped to [start, end], and whether they lie there or at most `slack` beyond it.
+
+    The others become `start`, so that results computed from them are finite. The derivative of the
+    clipped ones is 1.
+    """
     near = (X - start >= -slack) & (X - end <= slack)
     x = jnp.where(near, X, start)
     return x + lax.stop_gradient(jnp.clip(x, start, end) - x), near

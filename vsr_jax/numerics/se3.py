@@ -9,9 +9,11 @@ kernels.
 
 import math
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..typing import Pose, Twist
@@ -19,16 +21,19 @@ from . import component as c
 from .component import Matrix, Vector
 
 _TERMS = 14
-_SWITCH = 4.0  # of theta^2
+"""Terms of the series: the first neglected one is below double precision for $\\theta^2 < 4$."""
+_SWITCH = 4.0
+"""Value of $\\theta^2$ where the closed form takes over; below it loses digits, and its derivatives
+lose more."""
 
 
 def exp_coefficients(x: Array) -> tuple[Array, Array, Array]:
     r"""Coefficients $\sin\theta/\theta$, $(1-\cos\theta)/\theta^2$, $(\theta-\sin\theta)/\theta^3$
     as entire functions of $x = \theta^2$.
 
-    A Taylor branch below $\theta = 2$ and the closed form above, each evaluated at a harmless
-    argument where the other one is taken, so that values and derivatives of any order are finite
-    and exact to rounding at every angle.
+    A Taylor series below $\theta = 2$ and the closed form above. Each branch is evaluated at a
+    harmless argument where the other one is used, so that values and derivatives of any order are
+    finite and exact to rounding at every angle.
     """
     near = x < _SWITCH
     below, above = jnp.where(near, x, 0.0), jnp.where(near, _SWITCH, x)
@@ -44,8 +49,7 @@ def exp_coefficients(x: Array) -> tuple[Array, Array, Array]:
 def _stumpff(x: Array, n: int) -> Array:
     r"""Series of the Stumpff function $c_n(x) = \sum_j (-x)^j / (2 j + n)!$ for $0 \le x < 4$.
 
-    Its derivative is $c_n' = -\frac12 (c_{n+1} - n\,c_{n+2})$: two more series instead of a
-    differentiated one.
+    Its derivative is $c_n' = -\frac12 (c_{n+1} - n\,c_{n+2})$, two series of the same kind.
     """
     value = jnp.zeros_like(x)
     for j in reversed(range(_TERMS)):
@@ -93,6 +97,14 @@ def skew(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
     return c.join_matrix(c.skew(c.split(v)))
 
 
+def unskew(matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch 3"]:
+    r"""Vector $v$ of the skew part of a matrix, $\tilde v = (A - A^T) / 2$ of its upper left block
+    of three rows."""
+    m = matrix
+    parts = (m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1])
+    return 0.5 * jnp.stack(parts, axis=-1)
+
+
 def hat(xi: Twist) -> Pose:
     r"""Matrix of a twist (eq. 2).
 
@@ -114,9 +126,7 @@ def vee(matrix: Pose) -> Twist:
 
     **Returns:** $\xi = (k, u)$, shape (6,).
     """
-    m = matrix
-    angular = 0.5 * jnp.stack([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]])
-    return jnp.concatenate([angular, m[:3, 3]])
+    return jnp.concatenate([unskew(matrix), matrix[:3, 3]])
 
 
 def pose(rotation: Matrix, position: Vector) -> Float[Array, "*batch 4 4"]:
@@ -124,6 +134,11 @@ def pose(rotation: Matrix, position: Vector) -> Float[Array, "*batch 4 4"]:
     zero = jnp.zeros_like(position[0])
     rows = [(*row, x) for row, x in zip(rotation, position, strict=True)]
     return c.join_matrix((*rows, (zero, zero, zero, zero + 1.0)))
+
+
+def base_pose(base: Array | None, dtype: Any) -> Array | np.ndarray:
+    """Pose of the base, shape (4, 4) or (4, 4, arms); the identity for None."""
+    return np.eye(4, dtype=dtype) if base is None else base
 
 
 def exp(omega: Twist) -> Pose:
@@ -150,16 +165,10 @@ def rotation_vector(rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
     r"""Axis times angle [rad] of a rotation, $\theta$ with $R = \exp \tilde\theta$, $|\theta| \le
     \pi$.
 
-    Smooth but at half a turn, where both signs are right. The axis is that of the skew part,
-    $\sin\theta\, n$; for large angles that of the symmetric part, $(1 - \cos\theta)\, n n^T$.
+    Smooth except at half a turn, where both signs are right. The axis is that of the skew part,
+    $\sin\theta\, n$, and for large angles that of the symmetric part, $(1 - \cos\theta)\, n n^T$.
     """
-    axis = 0.5 * jnp.stack(
-        [
-            rotation[2, 1] - rotation[1, 2],
-            rotation[0, 2] - rotation[2, 0],
-            rotation[1, 0] - rotation[0, 1],
-        ]
-    )
+    axis = unskew(rotation)
     cosine = 0.5 * (jnp.trace(rotation) - 1)
     square = jnp.dot(axis, axis)
     near, large = (square < 1e-8) & (cosine > 0), cosine < -0.5
@@ -180,7 +189,7 @@ def _blocks(a: Array, b: Array, c_: Array, d: Array) -> Float[Array, "6 6"]:
 
 
 def adjoint(g: Pose) -> Float[Array, "6 6"]:
-    r"""Adjoint map of a pose, which carries twists from the body to the world.
+    r"""Adjoint map of a pose; it maps twists from the body frame to the world frame.
 
     $\mathrm{Ad}_g = \begin{pmatrix} R & 0 \\ \tilde r R & R \end{pmatrix}$, shape (6, 6).
     """
@@ -189,7 +198,7 @@ def adjoint(g: Pose) -> Float[Array, "6 6"]:
 
 
 def coadjoint(g: Pose) -> Float[Array, "6 6"]:
-    r"""Co-adjoint map of a pose, which carries wrenches from the body to the world.
+    r"""Co-adjoint map of a pose; it maps wrenches from the body frame to the world frame.
 
     $\mathrm{Ad}^*_g = \begin{pmatrix} R & \tilde r R \\ 0 & R \end{pmatrix} =
     \mathrm{Ad}_{g^{-1}}^T$, shape (6, 6).

@@ -19,7 +19,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..arm.scene import Scene
-from ..mechanics.arm_balance import Unknown, imbalance_of, problem_of, state_of
+from ..mechanics.arm_balance import ArmUnknown, imbalance_of, problem_of, state_of
 from ..mechanics.arm_tangent import approximate_solve
 from ..mechanics.balance import solve_balance
 from ..models.base import Model, SteppedModel
@@ -135,12 +135,12 @@ def _together(
         X = model.grid(scene).X.T.reshape(-1)
         turning = tuple(jnp.interp(grid.X, X, x.T.reshape(-1)) for x in state.turning)
 
-    def correct(_: Any, unknown: Unknown) -> Unknown:
+    def correct(_: Any, unknown: ArmUnknown) -> ArmUnknown:
         at = state_of(unknown, problem, kind)
         step, _ = approximate_solve(
             unknown, at, imbalance_of(unknown, at, problem, kind), problem, kind
         )
         return c.subtract(unknown, cast(step, xi[0].dtype))
 
-    start = Unknown(xi, tuple(-forces[place] for place in kind.cables), turning)
+    start = ArmUnknown(xi, tuple(-forces[place] for place in kind.cables), turning)
     return lax.fori_loop(0, _PASSES, correct, start).xi

@@ -26,8 +26,8 @@ from jaxtyping import Array, Float
 
 from ..arm.scene import CrossSections, Scene
 from ..mechanics.balance import (
-    chosen,
-    chosen_rows,
+    free_block,
+    free_components,
     residual,
     spread,
     tangent,
@@ -55,8 +55,8 @@ def extreme(scene: Scene, forces: Vector, nodes: Nodes, *, greatest: bool = Fals
     """
     if scene.loads:
         return _extreme(arm_of(scene, forces, nodes), -1 if greatest else 0)
-    lower = chosen_rows(tangent(nodes.xi, nodes.sections, nodes.tau(forces)), scene.free)
-    root = jnp.sqrt(c.join(chosen(nodes.sections.stiffness, scene.free)))
+    lower = free_block(tangent(nodes.xi, nodes.sections, nodes.tau(forces)), scene.free)
+    root = jnp.sqrt(c.join(free_components(nodes.sections.stiffness, scene.free)))
     values = jnp.linalg.eigvalsh(
         c.join_matrix(c.symmetric(lower)) / (root[..., :, None] * root[..., None, :])
     )
@@ -170,7 +170,7 @@ class ScaledTangent(Operator):
     def _times(self, v: Array) -> Array:
         x = spread(tuple(self.units * v), self.free)
         r = c.subtract(c.matvec(c.symmetric(self.lower), x), _reaction_change(x, self.along))
-        return self.weight * self.units * jnp.stack(chosen(r, self.free))
+        return self.weight * self.units * jnp.stack(free_components(r, self.free))
 
 
 def _projected(v: Array, units: Array, taut: tuple[Array, ...]) -> Array:
@@ -187,7 +187,7 @@ def arm_of(scene: Scene, forces: Vector, nodes: Nodes) -> Arm:
     assert loads is not None
     xi = tuple(jnp.broadcast_to(x, grid.X.shape) for x in nodes.xi)
     stiffness = jnp.stack(
-        [jnp.broadcast_to(s, grid.X.shape) for s in chosen(sections.stiffness, free)]
+        [jnp.broadcast_to(s, grid.X.shape) for s in free_components(sections.stiffness, free)]
     )
     there = grid.weight > 0
     units = jnp.where(there, 1 / jnp.sqrt(jnp.where(there, grid.weight, 1.0) * stiffness), 0.0)
@@ -197,7 +197,7 @@ def arm_of(scene: Scene, forces: Vector, nodes: Nodes) -> Arm:
         unit = (
             grid.weight
             * units
-            * jnp.stack(chosen(thread_wrench(thread_direction(xi, path)[0], path), free))
+            * jnp.stack(free_components(thread_wrench(thread_direction(xi, path)[0], path), free))
         )
         unit = unit if reach is None else reach * unit
         for other in taut:
