@@ -99,7 +99,7 @@ def _by_numbers(eq: Equilibrium) -> tuple[Array, Array, Array]:
         [*(by_numbers[name].reshape(6, -1) for name in numbers), by_inputs], axis=1
     ).T
     values = jnp.concatenate([*(x.reshape(-1) for x in numbers.values()), eq.inputs])
-    return values, eq._mask(rows[:, :3]), eq._mask(rows[:, 3:])
+    return values, eq.masked(rows[:, :3]), eq.masked(rows[:, 3:])
 
 
 def _motion(tip: Pose, here: Pose) -> Float[Array, "6"]:
@@ -121,7 +121,7 @@ def tip_jacobian(eq: Equilibrium) -> Float[Array, "6 inputs"]:
 
 @eqx.filter_jit
 def _by_inputs(eq: Equilibrium) -> Array:
-    return eq._mask(
+    return eq.masked(
         jax.jacfwd(lambda inputs: _motion(solve(eq.scene, inputs, model=eq.model).tip, eq.tip))(
             eq.inputs
         )
@@ -149,7 +149,7 @@ def _compliance(eq: Equilibrium) -> Array:
         found = jax.jacfwd(lambda wrench: _motion(_pushed(eq, wrench).tip, eq.tip))(
             jnp.zeros(6, eq.inputs.dtype)
         )
-        return jnp.where(eq.converged, found, jnp.nan)
+        return eq.masked(found)
     nodes, free = eq.nodes, jnp.array(eq.scene.free)
     rows = tangent(nodes.xi, nodes.sections, nodes.tau(eq.sound_forces))
     H = c.join_matrix(c.symmetric(free_block(rows, eq.scene.free))).reshape(
@@ -159,7 +159,7 @@ def _compliance(eq: Equilibrium) -> Array:
     G = jax.vmap(lambda g: _carried(g, eq.tip))(poses)[:, free]
     weight = jnp.broadcast_to(nodes.grid.weight, nodes.grid.X.shape).reshape(-1)
     found = jnp.einsum("x,xai,xaj->ij", weight, G, jnp.linalg.solve(H, G))
-    return jnp.where(eq.converged, found, jnp.nan)
+    return eq.masked(found)
 
 
 def _pushed(eq: Equilibrium, wrench: Float[Array, "6"]) -> Equilibrium:

@@ -50,6 +50,10 @@ class Solved(eqx.Module):
                 f"in jax.vmap(lambda eq: eq.tip)(eqs)"
             )
 
+    def masked(self, tree: T) -> T:
+        """Arrays, NaN where the solve failed."""
+        return jax.tree.map(lambda x: jnp.where(self.converged, x, jnp.nan), tree)
+
     def value(self, name: str) -> Any:
         """The quantity of the table with that name, also one that was added to it.
 
@@ -80,7 +84,7 @@ class Quantity(Generic[T]):
         self._program = eqx.filter_jit(self._masked)
 
     def _masked(self, eq: Solved) -> T:
-        return jax.tree.map(lambda x: jnp.where(eq.converged, x, jnp.nan), self.compute(eq))
+        return eq.masked(self.compute(eq))
 
     def __call__(self, eq: Solved) -> T:
         eq.refuse_batch()

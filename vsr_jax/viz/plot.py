@@ -102,7 +102,7 @@ def arm(
             f"figure.add_subplot(projection='3d')"
         )
     if surface:
-        x, y, z = np.moveaxis(samples.wall, -1, 0)
+        x, y, z = np.moveaxis(np.asarray(samples.wall), -1, 0)
         ax.plot_surface(
             x,
             y,
