@@ -7,7 +7,6 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..arm.scene import Scene
@@ -17,7 +16,7 @@ from ..mechanics.reaction import loading, react_at
 from ..models.base import Model, Nodes, Outcome, Status
 from ..numerics import component as c
 from ..numerics.component import Vector
-from ..typing import Pose, Scalar
+from ..typing import Pose, Scalar, VectorLike
 from ..validation import is_traced, on_arm
 from .energy import Energy, energy_of
 from .estimate import Error, error_of
@@ -66,7 +65,7 @@ class Equilibrium(Solved):
         """The status in words."""
         return Status(int(self.status)).message
 
-    def summary(self, X: ArrayLike = 61, values: Sequence[str] = ()) -> Summary:
+    def summary(self, X: VectorLike = 61, values: Sequence[str] = ()) -> Summary:
         """Everything along the arm, and any other quantities, from one compiled program.
 
         **Arguments:** `X`: how many stations, evenly spaced on the arm, or their abscissas [m];
@@ -193,7 +192,7 @@ class Equilibrium(Solved):
         forces (eq. 20)."""
         return self.model.coordinates(self.scene, self.sound_forces, self.state)
 
-    def thread(self, index: int, X: ArrayLike) -> Float[Array, "... 3"]:
+    def thread(self, index: int, X: VectorLike) -> Float[Array, "... 3"]:
         """Position [m] of thread `index` where it crosses the sections at X: $r + R d$.
 
         **Arguments:** `index`: place of its actuator in the scene, from 0; `X` [m]: between the

@@ -19,12 +19,12 @@ from typing import Any, Generic, TypeVar, overload
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from ..arm.scene import Scene
 from ..models.base import Status
 from ..numerics.quadrature import onto
+from ..typing import VectorLike
 from ..validation import ROUNDING, on_arm
 
 T = TypeVar("T")
@@ -121,13 +121,13 @@ class AlongArm:
         assert isinstance(entry, AlongArm)
         return self.compute(eq, entry.at(eq, X))
 
-    def __call__(self, eq: Solved, X: ArrayLike) -> Array:
+    def __call__(self, eq: Solved, X: VectorLike) -> Array:
         return self._program(eq, abscissas(eq, X))
 
     @overload
     def __get__(self, eq: None, owner: Any = None) -> "AlongArm": ...
     @overload
-    def __get__(self, eq: Solved, owner: Any = None) -> Callable[[ArrayLike], Array]: ...
+    def __get__(self, eq: Solved, owner: Any = None) -> Callable[[VectorLike], Array]: ...
     def __get__(self, eq: Any, owner: Any = None) -> Any:
         return self if eq is None else partial(self, eq)
 
@@ -175,7 +175,7 @@ def _entered(entry: Entry) -> Entry:
     return entry
 
 
-def abscissas(eq: Solved, X: ArrayLike) -> Array:
+def abscissas(eq: Solved, X: VectorLike) -> Array:
     """Abscissas [m] on the arm, one or several in a row, in the precision of the equilibrium.
 
     **Raises:** `ValueError` for a batch of equilibria, another shape, and an X beyond the arm where

@@ -7,9 +7,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from ..typing import VectorLike
 from ..validation import choice, is_traced
 from .quantities import QUANTITIES, AlongArm, Quantity, Solved, abscissas
 
@@ -42,7 +42,7 @@ class Summary(eqx.Module):
         )
 
 
-def summary_of(eq: Solved, X: ArrayLike = 61, values: Sequence[str] = ()) -> Summary:
+def summary_of(eq: Solved, X: VectorLike = 61, values: Sequence[str] = ()) -> Summary:
     """The summary of an equilibrium.
 
     **Arguments:** `X`: how many stations, evenly spaced on the arm, or their abscissas [m];
@@ -56,7 +56,7 @@ def summary_of(eq: Solved, X: ArrayLike = 61, values: Sequence[str] = ()) -> Sum
     return _compiled(eq, abscissas(eq, _stations(eq, X)), names)
 
 
-def _stations(eq: Solved, X: ArrayLike) -> Any:
+def _stations(eq: Solved, X: VectorLike) -> Any:
     if isinstance(X, int | np.integer) and not isinstance(X, bool):
         return jnp.linspace(0.0, 1.0, int(X)) * eq.scene.rod.length
     return X if is_traced(X) else jnp.atleast_1d(jnp.asarray(X))

@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array
 from matplotlib.colors import to_rgb
 from matplotlib.ticker import MaxNLocator
@@ -20,6 +19,7 @@ from mpl_toolkits.mplot3d.axes3d import Axes3D
 from ..arm.rod import STRAINS
 from ..solution.equilibrium import Equilibrium
 from ..solution.summary import ANGLES, Summary, compiled_summary
+from ..typing import VectorLike
 from ..validation import choice, on_arm
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -39,7 +39,7 @@ _THINNEST_BOX = 0.35
 
 
 def sample(
-    eq: Equilibrium, stations: ArrayLike = 60, *, program: Callable | None = None
+    eq: Equilibrium, stations: VectorLike = 60, *, program: Callable | None = None
 ) -> Summary:
     """The summary of an equilibrium in NumPy arrays; `arm` and `strains` take it in place of `eq`.
 
@@ -58,13 +58,13 @@ def sample(
     return jax.tree.map(np.asarray, found)
 
 
-def sampling(eq: Equilibrium, stations: ArrayLike = 60) -> Callable:
+def sampling(eq: Equilibrium, stations: VectorLike = 60) -> Callable:
     """The program of `sample`, compiled: for this equilibrium and for all of the same model and
     kind of scene."""
     return compiled_summary(eq, _abscissas(eq, stations))
 
 
-def _abscissas(eq: Equilibrium, stations: ArrayLike) -> Array:
+def _abscissas(eq: Equilibrium, stations: VectorLike) -> Array:
     if isinstance(stations, int | np.integer):
         return jnp.linspace(0.0, 1.0, int(stations)) * eq.scene.rod.length
     return jnp.asarray(stations, eq.inputs.dtype)
@@ -77,7 +77,7 @@ def arm(
     color: Any = COLORS[0],
     label: str | None = None,
     linestyle: Any = "-",
-    stations: ArrayLike = 60,
+    stations: VectorLike = 60,
     surface: bool = True,
     threads: bool = True,
     **line: Any,
@@ -161,7 +161,7 @@ def strains(
     color: Any = COLORS[0],
     label: str | None = None,
     linestyle: Any = "-",
-    stations: ArrayLike = 60,
+    stations: VectorLike = 60,
     **line: Any,
 ) -> np.ndarray:
     """The strains over X, one panel each; no panel spans less than 0.02, so that rounding does not
