@@ -91,9 +91,10 @@ def test_locked_strains_that_single_precision_cannot_hold():
 
 CASES = {
     "friction": ([], {}),
-    "gravity and friction": ([vsr.Gravity()], {}),
-    "length control and friction": ([], {"control": "length"}),
-    "all of them and a follower force": ([vsr.Gravity(), JET], {"control": "length"}),
+    "gravity, length control, friction and a follower force": (
+        [vsr.Gravity(), JET],
+        {"control": "length"},
+    ),
 }
 
 

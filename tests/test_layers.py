@@ -1,6 +1,7 @@
 """The layout of the package: which package may import which, and what its face shows."""
 
 import ast
+import functools
 import pathlib
 import subprocess
 import sys
@@ -28,8 +29,13 @@ all."""
 MODULES = sorted(path.relative_to(FOLDER).as_posix() for path in FOLDER.glob("*/*.py"))
 
 
+@functools.cache
 def imports(path):
     """Places that a file imports from vsr_jax: ("arm", "scene", "Scene")."""
+    return tuple(_imports(path))
+
+
+def _imports(path):
     own = path.parent.name
     for node in ast.walk(ast.parse(path.read_text())):
         if not isinstance(node, ast.ImportFrom):
