@@ -268,5 +268,5 @@ def test_a_scene_without_actuators_is_at_rest():
 
 
 def test_repr_tells_the_outcome():
-    assert "converged in 3 steps, tip=(" in repr(vsr.solve(SCENE, [1.0, 0.0, 0.0]))
+    assert "converged in 2 steps, tip=(" in repr(vsr.solve(SCENE, [1.0, 0.0, 0.0]))
     assert "collapsed" in repr(vsr.solve(SCENE, [1e4, 0.0, 0.0]))
