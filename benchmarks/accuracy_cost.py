@@ -1,12 +1,12 @@
-"""What accuracy costs on seven arms by every model: tip, strain and gradient errors against times,
-alone and in a batch.
+"""Cost of accuracy on seven arms for every model: tip, strain and gradient errors against times,
+single and in a batch.
 
     pip install . && python benchmarks/accuracy_cost.py [--scenes B2 ...] [--batch-size 128]
         [--json FILE] [--plots FOLDER]
 
-Errors are the largest of eight shapes against 256 steps of order 6 (96 under loads), times medians
-of rounds in which all settings of a scene take turns. Scenes that the JSON file already holds are
-not measured again. The peer's points on B1 are those of `bench_peers.py`, from its own run:
+Errors are the largest over eight shapes, against 256 steps of order 6 (96 under loads). Times are
+medians over rounds in which all settings of a scene take turns. Scenes already in the JSON file are
+not measured again. The points of the peer on B1 come from a separate run of `bench_peers.py`;
 `--peers` names its JSON file.
 """
 
@@ -42,8 +42,8 @@ FIGURES = {
 
 
 class Study(NamedTuple):
-    """An arm, the least and greatest inputs, a basis made for it, and whether only some of the
-    settings are measured, where each takes a minute to compile."""
+    """An arm, the bounds of its inputs, a basis made for it, and whether to measure only the
+    settings in `SPARSE`, because each takes a minute to compile."""
 
     scene: vsr.Scene
     low: tuple[float, ...]
@@ -64,8 +64,8 @@ def fast_helix() -> Study:
 
 
 def two_sections() -> Study:
-    """A base section twice as stiff as the tip's, a tendon that ends where it does, and one to the
-    tip."""
+    """A base section twice as stiff as the tip section, with one tendon to the end of the base
+    section and one to the tip."""
     arm = vsr.Rod(
         0.3, vsr.Circular(0.01), vsr.Material(vsr.Piecewise((0.15,), (8e5, 4e5)), poisson=0.45)
     )
@@ -98,7 +98,7 @@ STUDIES: dict[str, Callable[[], Study]] = {
 
 
 def run(name: str, batch_size: int) -> list[accuracy.AccuracyRow]:
-    """The rows of one scene, printed as they come."""
+    """The rows of one scene; progress and the table are printed."""
     study = STUDIES[name]()
     inputs = jnp.asarray(
         np.random.default_rng(0).uniform(study.low, study.high, (batch_size, len(study.low)))
@@ -116,7 +116,7 @@ def run(name: str, batch_size: int) -> list[accuracy.AccuracyRow]:
 
 
 def peers(path: str | None) -> dict[str, dict[str, Any]]:
-    """Times a shape [us] and largest errors of SoRoMoX on B1, from the JSON file of
+    """Times per shape [us] and largest errors of SoRoMoX on B1, from the JSON file of
     `bench_peers.py`."""
     if path is None:
         return {}
@@ -135,7 +135,7 @@ def peers(path: str | None) -> dict[str, dict[str, Any]]:
 
 
 def asked_for(rounds: int = 30, batch_size: int = 1024) -> list[dict[str, Any]]:
-    """What a millimetre, a micrometre and a nanometre cost on B2 where `vsr.plan` chooses: all
+    """Times on B2 with the steps that `vsr.plan` chooses for each of `accuracy.TOLERANCES`, all
     timed in turn."""
     study = STUDIES["B2"]()
     inputs = jnp.asarray(np.random.default_rng(0).uniform(study.low, study.high, (batch_size, 2)))
@@ -147,7 +147,7 @@ def asked_for(rounds: int = 30, batch_size: int = 1024) -> list[dict[str, Any]]:
     jobs = []
     for plan in (
         plans.values()
-    ):  # several calls a turn: the first after the longest job's finds its memory given back
+    ):  # several calls per turn: the first one after the longest job has to allocate memory again
         jobs.append(
             Timed(
                 _tips(study.scene.astype(plan.dtype), plan.model),
@@ -171,7 +171,7 @@ def asked_for(rounds: int = 30, batch_size: int = 1024) -> list[dict[str, Any]]:
         median = job.summary()["median_us"] / batch_size
         print(
             f"{tolerance:g} m: {plan.model.steps} steps, {plan.dtype}, error {error:.1e} m, "
-            f"{median:.1f} us a shape"
+            f"{median:.1f} us per shape"
         )
     return found
 
@@ -181,7 +181,7 @@ def _tips(scene: vsr.Scene, model: vsr.StrainDependent) -> Callable:
 
 
 def estimates(rounds: int = 30, batch_size: int = 256) -> dict[str, Any]:
-    """What `eq.error` adds to a solve with the tip, at 16 steps, in a batch."""
+    """Time that `eq.error` adds to a solve with the tip, at 16 steps, in a batch."""
     found = {}
     for name in ("B2", "loaded"):
         study, model = STUDIES[name](), vsr.StrainDependent(16)
@@ -200,15 +200,14 @@ def estimates(rounds: int = 30, batch_size: int = 256) -> dict[str, Any]:
         alone, both = (job.summary()["median_us"] / batch_size for job in jobs)
         found[name] = {"tip_us": alone, "tip_and_error_us": both}
         print(
-            f"{name}: tip {alone:.1f} us a shape, with its error {both:.1f}: {both / alone:.2f} "
-            f"times"
+            f"{name}: tip {alone:.1f} us per shape, with its error {both:.1f}: "
+            f"{both / alone:.2f} times"
         )
     return found
 
 
 def stiff(calls: int = 5) -> dict[str, Any]:
-    """One solve of B2 by an implicit solver, for stiff equations, which these are not, and by an
-    explicit one."""
+    """One solve of B2 by an explicit solver and by an implicit one; the equations are not stiff."""
     study, found = STUDIES["B2"](), {}
     inputs = jnp.asarray(study.low)
     exact = vsr.solve(study.scene, inputs, model=vsr.StrainDependent(256)).tip[:3, 3]
@@ -224,7 +223,7 @@ def stiff(calls: int = 5) -> dict[str, Any]:
         found[type(solver).__name__] = {"error": error, **job.summary()}
         print(
             f"{type(solver).__name__}, rtol 1e-5: error {error:.1e} m, "
-            f"{job.summary()['median_us'] / 1e3:.1f} ms a shape"
+            f"{job.summary()['median_us'] / 1e3:.1f} ms per shape"
         )
     return found
 

@@ -1,13 +1,13 @@
-"""Design by gradient: hidden routings found from the shapes they make, and what a step of the
-descent costs.
+"""Design by gradient: hidden routings identified from the shapes they produce, and the cost of a
+descent step.
 
     pip install . && python benchmarks/bench_design.py [--starts 10] [--arms 5] [--json FILE]
 
-Two helical threads, of which radius, angle and phase are hidden; known are ten points of the arm's
-axis under five sets of tensions. For each random start: how far the threads found lie from the
-hidden ones at most. All starts run side by side in one call of `vsr.design`, whose time is told
-with compiling in it for the first arm, without for the others. Then the time of one step against
-that of the same solves alone, taken in turn.
+The radii, angles and phases of two helical threads are hidden; ten points of the arm's axis are
+known for each of five sets of tensions. For each random start the result is the largest distance of
+the threads found from the hidden ones. All starts run as a batch in one call of `vsr.design`; the
+time of the first arm includes compilation, that of the others does not. The time of one step is
+compared with that of its solves alone, both timed in turn.
 """
 
 import argparse
@@ -36,7 +36,7 @@ FREE = {
 
 
 def arm(helices: Any) -> vsr.Scene:
-    """An arm with threads of given radius, angle and phase."""
+    """An arm with helical threads of given radius, angle and phase."""
     rod = vsr.Rod(LENGTH, vsr.Circular(vsr.Taper(0.012, 0.010)), vsr.Material(5.93e5, shear=2.0e5))
     return vsr.Scene(
         rod, [vsr.Tendon(vsr.Helix(radius, angle, phase=phase)) for radius, angle, phase in helices]
@@ -54,7 +54,7 @@ def hidden(seed: int) -> vsr.Scene:
 
 
 def shapes(scene: vsr.Scene) -> vsr.objective.CurveError:
-    """The objective to make the shapes of a scene."""
+    """The objective that is zero for the shapes of a scene."""
     X = jnp.asarray(LENGTH * np.arange(1, 11) / 10)
     return vsr.objective.CurveError(
         jax.vmap(lambda u: vsr.solve(scene, u, model=MODEL).position(X))(jnp.asarray(TENSIONS)),
@@ -64,7 +64,7 @@ def shapes(scene: vsr.Scene) -> vsr.objective.CurveError:
 
 
 def paths(scene: vsr.Scene) -> np.ndarray:
-    """Where the threads cross the sections [m], shape (threads, stations, 2)."""
+    """Positions of the threads in the sections [m], shape (threads, stations, 2)."""
     X = jnp.linspace(0, LENGTH, 101)
     return np.asarray(
         [jnp.stack(jax.vmap(actuator.routing)(X), axis=-1) for actuator in scene.actuators]
@@ -72,8 +72,8 @@ def paths(scene: vsr.Scene) -> np.ndarray:
 
 
 def found(seed: int, starts: int) -> dict[str, Any]:
-    """How far the threads of each random start come to lie from those of a hidden arm; the start at
-    the given scene is left out."""
+    """Largest distance of the threads found from those of a hidden arm, for each random start; the
+    start at the given scene is left out."""
     secret = hidden(seed)
     wanted = shapes(secret)
     start = time.perf_counter()
@@ -101,7 +101,7 @@ def found(seed: int, starts: int) -> dict[str, Any]:
 
 
 def step_cost(starts: int, rounds: int) -> dict[str, Any]:
-    """Times [us] of a step of all starts, and of the objective alone, whose solves a step needs."""
+    """Times [us] of a step of all starts, and of its evaluation of the objective alone."""
     problem, _, given = formulate(unknowing(), FREE, shapes(hidden(0)), TENSIONS, (), {}, MODEL)
     optimizer = adam(0.05, STEPS)
     states = begin(problem, optimizer, given, starts, 4, 0)

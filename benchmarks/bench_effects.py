@@ -1,5 +1,5 @@
-"""What each effect of a scene costs: operations, compile time, and the times of a solve, single and
-in a batch of 1,024.
+"""Cost of each effect of a scene: operations, compile time, and the times of a solve, single and in
+a batch of 1,024.
 
     python benchmarks/bench_effects.py [--json FILE] [--rounds N]
 
@@ -25,13 +25,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--json", type=Path, help="write the figures here too")
-    parser.add_argument("--rounds", type=int, default=15, help="how often each solve is timed (15)")
+    parser.add_argument("--json", type=Path, help="also write the results to this file")
+    parser.add_argument("--rounds", type=int, default=15, help="timings per solve (15)")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     print(
         f"{machine()}, jax {jax.__version__}; 16 steps of order 6, {BATCH} in a batch; median (10 "
-        f"%-90 %), x: to the row above"
+        f"%-90 %), x: relative to the row above"
     )
     costs = effects.measure(BATCH, options.rounds)
     print("\n".join(effects.table(costs)))

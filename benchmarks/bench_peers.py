@@ -1,20 +1,19 @@
-"""vsr_jax and its peers on the same scenes, in one process: an arm with a parallel thread, with a
-helical one, and that with loads.
+"""vsr_jax and other tools on the same scenes, in one process: an arm with a parallel thread, one
+with a helical thread, and the latter with loads.
 
     pip install ".[bench]" && python benchmarks/bench_peers.py [--scenes A1 B1 loaded] [--slow]
         [--json FILE] [--plot FILE]
 
 1,024 tensions drawn uniformly from [-15, 0] N (the sign of the paper: negative pulls), float64,
-each shape solved on its own from a cold start. Tip errors are distances to vsr_jax at 96 steps of
-order 6, which is itself held against an independent solution of the loaded scene. "gradient" is the
-derivative of the tip's height, summed over the batch, by the radius, angle and phase of the thread.
-All functions are compiled first and then timed in rounds, one after another, so that a busy machine
-is busy for both tools alike.
+each shape solved independently from a cold start. Tip errors are distances to vsr_jax at 96 steps
+of order 6, which is itself compared with an independent solution of the loaded scene. "gradient" is
+the derivative of the tip's height, summed over the batch, with respect to the radius, angle and
+phase of the thread. All functions are compiled first and then timed in rounds, one after another,
+so that other load on the machine affects both tools alike.
 
-How SoRoMoX is used, which has no static solver, is told in `peer_soromox`. `--slow` adds single
-solves, at -5 N, by SciPy's `solve_bvp` (`peer_scipy`) and by PyElastica's dynamics
-(`peer_elastica`, arms without loads). `--formulations` times the ways in which SoRoMoX was tried on
-the loaded scene.
+SoRoMoX has no static solver; `peer_soromox` describes how it is used. `--slow` adds single solves
+at -5 N by SciPy's `solve_bvp` (`peer_scipy`) and by PyElastica's dynamics (`peer_elastica`, arms
+without loads). `--formulations` times the formulations tried with SoRoMoX on the loaded scene.
 """
 
 import argparse
@@ -94,8 +93,8 @@ def their_jobs(
 
 
 def errors(tips: Any, truth: np.ndarray) -> dict[str, Any]:
-    """Largest and median distance to the truth [m] among the shapes that came back, and how many
-    did not."""
+    """Largest and median distance to the reference [m] over the finite results, and the number of
+    the others."""
     distance = np.linalg.norm(np.asarray(tips) - truth, axis=1)
     found = distance[np.isfinite(distance)]
     worst, median = (
@@ -129,7 +128,7 @@ def measure(
 
 
 def rate(entry: dict[str, float]) -> str:
-    """Shapes a second, with their spread, as text."""
+    """Shapes per second, with their spread, as text."""
     return "{:.0f} ({:.0f}-{:.0f})".format(
         *(1e6 * BATCH / entry[key] for key in ("median_us", "high_us", "low_us"))
     )
@@ -161,8 +160,8 @@ def print_rows(rows: list[dict[str, Any]]) -> None:
 
 
 def compare(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """For each setting of the peer, our fastest that loses no shape and errs no more, in the
-    largest and in the median error."""
+    """For each setting of the peer, the fastest setting of vsr_jax that loses no shape and whose
+    largest and median errors are no larger."""
     pairs = []
     for theirs in (row for row in rows if row["tool"] != "vsr_jax"):
         able = [row for row in rows if row["tool"] == "vsr_jax" and not row["lost"]]
@@ -188,10 +187,10 @@ def compare(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def print_pairs(pairs: list[dict[str, Any]]) -> None:
-    """Table of the comparison at equal or better error."""
+    """Table of the comparison at equal or smaller error."""
     print(
-        "\nvsr_jax over SoRoMoX at equal or better tip error, largest and median; times as many a "
-        "second:\n"
+        "\nSpeed of vsr_jax relative to SoRoMoX at equal or smaller tip errors, largest and "
+        "median:\n"
     )
     print("| SoRoMoX | vsr_jax | single | 1,024 in a batch | the same, CPU time | their gradient |")
     print("|" + "---|" * 6)
@@ -206,12 +205,12 @@ def print_pairs(pairs: list[dict[str, Any]]) -> None:
 def formulations(
     peer: Any, taus: jax.Array, truth: np.ndarray, rounds: int, batch_size: int = 64
 ) -> list[dict[str, Any]]:
-    """Rows for the ways of posing the statics to SoRoMoX, at one setting, in a small batch."""
+    """Rows for the formulations of the statics in SoRoMoX, at one setting, in a small batch."""
     chosen = peer.Setting(*CASES["loaded"].theirs[1])
     arm, path = peer.build(chosen, CASES["loaded"].numbers)
     rows = []
     print(f"\nSoRoMoX's formulations, {chosen}, {batch_size} in a batch:\n")
-    print("| formulation | tip error max [m] | median | us a shape | compile [s] |")
+    print("| formulation | tip error max [m] | median | us per shape | compile [s] |")
     print("|" + "---|" * 5)
     for name, solve in peer.FORMULATIONS.items():
 
@@ -242,8 +241,8 @@ def formulations(
 
 
 def truths(case: Case, taus: jax.Array) -> tuple[np.ndarray, float | None]:
-    """Tips [m] at all tensions by vsr_jax at high resolution, and how far its tip is from the
-    independent one [m]."""
+    """Tips [m] at all tensions by vsr_jax at high resolution, and the distance [m] of its tip from
+    the independent one."""
     tips = jax.jit(partial(our_tips, vsr.StrainDependent(*TRUTH)))
     found = np.asarray(
         tips(our_scene(case.numbers), jnp.append(taus, jnp.array([[case.tension]]), axis=0))
@@ -325,7 +324,7 @@ def run(name: str, peer: Any, taus: jax.Array, rounds: int, slow: bool) -> dict[
 
 
 def draw(report: dict[str, Any], path: str) -> None:
-    """Shapes a second over tip error, a panel for each scene."""
+    """Shapes per second over tip error, one panel per scene."""
     scenes = report["scenes"]
     figure = Figure(figsize=(4 * len(scenes), 3.8), layout="constrained")
     for ax, (name, found) in zip(
@@ -352,7 +351,7 @@ def draw(report: dict[str, Any], path: str) -> None:
             xscale="log",
             yscale="log",
             xlabel="largest tip error [m]",
-            ylabel="shapes a second",
+            ylabel="shapes per second",
             title=name,
         )
         ax.grid(alpha=0.3)
@@ -370,21 +369,19 @@ def main() -> None:
         nargs="+",
         choices=tuple(CASES),
         default=tuple(CASES),
-        help="which of them (default: all)",
+        help="scenes to run (default: all)",
     )
     parser.add_argument(
-        "--slow", action="store_true", help="single solves by SciPy and PyElastica too"
+        "--slow", action="store_true", help="add single solves by SciPy and PyElastica"
     )
     parser.add_argument(
         "--formulations",
         action="store_true",
-        help="time the ways of posing the loaded statics to SoRoMoX as well",
+        help="also time the formulations of the loaded statics in SoRoMoX",
     )
-    parser.add_argument(
-        "--rounds", type=int, default=5, help="how often each function is timed (5)"
-    )
-    parser.add_argument("--json", type=Path, help="write the figures here too")
-    parser.add_argument("--plot", metavar="FILE", help="draw them")
+    parser.add_argument("--rounds", type=int, default=5, help="timings per function (5)")
+    parser.add_argument("--json", type=Path, help="also write the results to this file")
+    parser.add_argument("--plot", metavar="FILE", help="plot the results")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     peer = load_peer()

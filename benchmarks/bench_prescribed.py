@@ -1,11 +1,11 @@
-"""Time of a loaded solve in a prescribed basis: alone, side by side, twice in one program, and its
-gradient.
+"""Time of a loaded solve in a prescribed basis: single, in a batch, two batches in one program, and
+its gradient.
 
     python benchmarks/bench_prescribed.py [--json FILE]
 
-A soft arm of 0.5 m that hangs from a horizontal clamp, bent by one tendon: Legendre polynomials of
-order 3 on both bendings, eight coordinates, tensions from 0 to 5 N, float64. `StrainDependent` on
-the same steps stands beside it in the same run.
+A soft arm of 0.5 m on a horizontal clamp, under its weight and bent by one tendon: Legendre
+polynomials of order 3 for both bending strains, eight coordinates, tensions from 0 to 5 N, float64.
+`StrainDependent` with the same steps is timed in the same run.
 """
 
 import argparse
@@ -36,7 +36,7 @@ REPEATS = 9
 def programs(
     model: vsr.Prescribed | vsr.StrainDependent,
 ) -> dict[str, tuple[Callable, jax.Array, int]]:
-    """Functions by name with their argument and the shapes that one call solves."""
+    """Functions by name, with their argument and the number of shapes per call."""
 
     def tip(tension: jax.Array) -> jax.Array:
         return vsr.solve(SCENE, tension, model=model).tip[:3, 3]

@@ -1,11 +1,11 @@
-"""Inverse statics in a batch: 1,024 targets that inputs drawn at random have reached, for three
-arms.
+"""Inverse statics in a batch: 1,024 targets, reachable because they are tips for random inputs, on
+three arms.
 
     pip install . && python benchmarks/bench_reach.py [--targets 1024] [--json FILE]
 
-For each arm: how many targets are reached within a millionth of a metre, the largest miss, compile
-time and targets a second; and the same for targets beyond the arm's length, none of which may be
-called reached.
+For each arm: the number of targets reached within 1 um, the largest miss, compile time and targets
+per second; and the same for targets beyond the arm's length, none of which may be reported as
+reached.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from vsr_jax.studies.timing import Timed, machine, take_turns
 MODEL = vsr.StrainDependent(12)
 MOST, MISS = 12.0, 1e-6
 BATCH = 64
-"""Targets side by side; the slowest of them keeps the others waiting."""
+"""Targets per batch; each batch takes as long as its slowest target."""
 
 
 def arms() -> dict[str, vsr.Scene]:

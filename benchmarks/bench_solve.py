@@ -1,5 +1,5 @@
-"""Time of a solve: compile, single, 1,024 in a batch and the batched gradient, in float32 and
-float64, in one run.
+"""Time of a solve: compilation, single, in a batch of 1,024 and with the batched gradient, in
+float32 and float64, in one run.
 
     python benchmarks/bench_solve.py [--json FILE] [--cold]
 
@@ -83,8 +83,8 @@ def measure(name: str, scene: vsr.Scene, model: vsr.StrainDependent, dtype: str)
 
 
 def cold_start(runs: int = 3) -> dict[str, float]:
-    """Medians of import, build and solve to the first tip of B1, each run in a process of its own
-    [s]."""
+    """Median times [s] of import, build and solve up to the first tip of B1, each run in a new
+    process."""
     rows = [
         subprocess.run(
             [sys.executable, "-c", COLD], capture_output=True, text=True, check=True
@@ -112,7 +112,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--json", type=Path, help="write the figures here too")
+    parser.add_argument("--json", type=Path, help="also write the results to this file")
     parser.add_argument("--cold", action="store_true", help="measure the cold start as well")
     options = parser.parse_args()
     report: dict[str, Any] = {
@@ -122,7 +122,7 @@ def main() -> None:
     if options.cold:
         report["cold"] = cold_start()
         print(
-            "first answer from a cold process:",
+            "first result of a cold process [s]:",
             ", ".join(f"{k} {v:.2f}" for k, v in report["cold"].items()),
         )
     jax.config.update("jax_enable_x64", True)
@@ -130,7 +130,9 @@ def main() -> None:
         ("A3, three threads", "A3", vsr.StrainDependent(32, 4)),
         ("B1, one helix", "B1", vsr.StrainDependent(16, 6)),
     ]
-    print(f"{report['machine']}, jax {report['jax']}; us a shape: median (10 %-90 %), compile time")
+    print(
+        f"{report['machine']}, jax {report['jax']}; us per shape: median (10 %-90 %), compile time"
+    )
     print(
         "| scene | nodes | dtype | single | strains, 1,024 | tips, 1,024 | gradient, 1,024 | "
         "gradient / tips |"

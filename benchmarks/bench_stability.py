@@ -1,12 +1,12 @@
-"""Time of the stability margin of a loaded catheter beside that of its solve, and of the dense
-eigenvalue problem it replaced.
+"""Time of the stability margin of a loaded catheter, compared with that of its solve and of a dense
+eigenvalue problem.
 
     python benchmarks/bench_stability.py [--json FILE] [--rounds N]
 
-Two sections, eight tendons, gravity and a force on the tip, all in turn in one run. "dense"
-differentiates the residual by every strain and computes all eigenvalues by LAPACK, without nodes on
-pieces without length, where it has 0 / 0. "gradient" is that of the margin by the tensions, through
-the solve.
+Two sections, eight tendons, gravity and a force on the tip; all programs are timed in turn in one
+run. "dense" differentiates the residual with respect to every strain and computes all eigenvalues
+by LAPACK. It leaves out nodes on pieces of zero length, where it would compute 0 / 0. "gradient" is
+that of the margin with respect to the tensions, through the solve.
 """
 
 import argparse
@@ -44,8 +44,8 @@ def catheter() -> vsr.Scene:
 
 
 def dense(eq: Equilibrium, there: np.ndarray) -> jax.Array:
-    """All eigenvalues of the symmetric part of the scaled tangent, as before Lanczos' method;
-    `there`: places of unknowns with weight."""
+    """Least and greatest eigenvalue of the symmetric part of the scaled tangent, without the
+    Lanczos method; `there`: indices of the unknowns at nodes with a positive weight."""
     nodes, tau = eq.nodes, eq.nodes.tau(eq.sound_forces)
     grid, loads = nodes.grid, loading(eq.scene, nodes.grid)
     assert loads is not None
@@ -68,7 +68,7 @@ def dense(eq: Equilibrium, there: np.ndarray) -> jax.Array:
 
 
 def count(jaxpr: Any) -> int:
-    """Equations of a program, those of the programs inside it included."""
+    """Number of equations of a program, including those of nested programs."""
     inner = [
         value
         for eqn in jaxpr.eqns
@@ -85,7 +85,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--json", type=Path, help="write the figures here too")
+    parser.add_argument("--json", type=Path, help="also write the results to this file")
     parser.add_argument("--rounds", type=int, default=15)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
@@ -132,11 +132,11 @@ def main() -> None:
     for name in ("margin", "dense", "gradient"):
         report[f"{name} / solve"] = rows[name]["median_us"] / rows["solve"]["median_us"]
     print(
-        f"{report['machine']}, jax {report['jax']}; margin {report['margin']:.6f}, off the dense "
-        f"one by {difference:.1e}"
+        f"{report['machine']}, jax {report['jax']}; margin {report['margin']:.6f}, differs from "
+        f"the dense one by {difference:.1e}"
     )
     print(
-        "| program | ms, median (10 %-90 %) | of a solve | compile [s] | equations |\n|"
+        "| program | ms, median (10 %-90 %) | per solve time | compile [s] | equations |\n|"
         + "---|" * 5
     )
     for name, row in rows.items():

@@ -1,16 +1,16 @@
-"""How fast and how large sweeps are: samples, nodes, threads, sections, loads, devices; the
-machine's limit; a million shapes, killed.
+"""Speed of sweeps by samples, nodes, threads, sections, loads and devices; the limit of the
+machine; a sweep of a million shapes, killed and resumed.
 
     pip install ".[sweep]" && python benchmarks/bench_sweep.py
         [--json FILE] [--plot FILE] [--million]
 
-The arm is the paper's B1, a helical thread, at 16 steps of order 6, with tensions from [0, 15] N,
-unless a row says otherwise. All rates are those of `vsr.sweep`, copies to and from the devices
-included, compiled before; medians of several runs in turn, with the fastest and the slowest. Each
-core of the CPU is a device, as `vsr-jax sweep` has it, unless a row says otherwise.
+Unless a row states otherwise, the arm is the paper's B1 with one helical thread, at 16 steps of
+order 6, with tensions from [0, 15] N, and each core of the CPU is a device, as in `vsr-jax sweep`.
+All rates are those of `vsr.sweep` without compilation, including copies to and from the devices:
+medians of several runs in turn, with the slowest and the fastest.
 
-`--million` sweeps a million shapes to disk in a process of its own, kills that at a random moment,
-lets another go on, and compares what is on disk with a sweep that nobody killed.
+`--million` sweeps a million shapes to disk in a separate process, kills it at a random time,
+resumes the sweep in another process, and compares the store with that of an uninterrupted sweep.
 """
 
 import argparse
@@ -56,7 +56,7 @@ print(1024 * int(re.search(r"VmHWM:\\s*(\\d+)", Path("/proc/self/status").read_t
 
 
 def rod(sections: int = 1) -> vsr.Rod:
-    """The paper's cylinder, in pieces that differ by a tenth in radius."""
+    """The paper's cylinder, in sections whose radii differ by 10 %."""
     radii = [0.01 * (1 + 0.1 * (i % 2)) for i in range(sections)]
     ends = [0.75 * (i + 1) / sections for i in range(sections - 1)]
     section = vsr.Circular(0.01) if sections == 1 else vsr.Circular(vsr.Piecewise(ends, radii))
@@ -72,19 +72,19 @@ def helix(threads: int = 1, sections: int = 1, loads: tuple = ()) -> vsr.Scene:
 
 
 def tensions(samples: int, threads: int = 1, dtype: str = "float64") -> np.ndarray:
-    """Tensions [N] from [0, 15] in all."""
+    """Tensions [N] whose sum over the threads lies in [0, 15]."""
     return np.random.default_rng(0).uniform(0, 15 / threads, (samples, threads)).astype(dtype)
 
 
 def place(eq: vsr.Equilibrium) -> dict[str, Any]:
-    """Where the tip is: what a workspace needs."""
+    """Position of the tip, the output that a workspace needs."""
     return {"tip": eq.tip[:3, 3]}
 
 
 def job(
     scene: vsr.Scene, inputs: np.ndarray, steps: int = STEPS, devices: Any = None
 ) -> Callable[[], Any]:
-    """A sweep ready to run, compiled."""
+    """A sweep that has run once, so that it is compiled."""
 
     def run() -> Any:
         return vsr.sweep(
@@ -101,7 +101,7 @@ def job(
 
 
 def rates(jobs: dict[str, tuple[Callable, int]], rounds: int = ROUNDS) -> list[dict[str, Any]]:
-    """Shapes a second of each job, all in turn."""
+    """Shapes per second of each job, all timed in turn."""
     seconds: dict[str, list[float]] = {name: [] for name in jobs}
     for _ in range(rounds):
         for name, (run, _) in jobs.items():
@@ -127,7 +127,7 @@ def rates(jobs: dict[str, tuple[Callable, int]], rounds: int = ROUNDS) -> list[d
 
 
 def studies() -> dict[str, list[dict[str, Any]]]:
-    """Rates by what is varied."""
+    """Rates of each study."""
     gravity, many = (vsr.Gravity(),), tensions(SAMPLES)
     few = 2048
     by = {
@@ -165,11 +165,11 @@ def studies() -> dict[str, list[dict[str, Any]]]:
 
 
 def limit(batch_size: int = 512) -> dict[str, float]:
-    """Floating-point operations: of the machine in a second, at most, and of a shape.
+    """Floating-point operations per shape, and the highest rate of the machine per second.
 
-    The operations of a shape are those of one Newton step at all nodes times the steps taken, and
-    those of all the rest, as XLA counts them: a division, a root and a sine count as one each,
-    which a processor takes ten times as long for.
+    The operations per shape are those of one Newton step at all nodes times the number of steps,
+    plus those of the rest, as counted by XLA. A division, a root and a sine count as one operation
+    each, although a processor takes ten times as long for them.
     """
     machine_rate = _most_operations()
     scene, model, inputs = helix(), vsr.StrainDependent(STEPS), jnp.asarray(tensions(batch_size))
@@ -195,7 +195,7 @@ def limit(batch_size: int = 512) -> dict[str, float]:
 def _most_operations(
     chains: int = 4, depth: int = 32, size: int = 65_536, times: int = 200
 ) -> float:
-    """Operations a second of chains of fused multiply-adds that stay in the registers, on all
+    """Operations per second of chains of fused multiply-adds that stay in the registers, on all
     devices at once."""
 
     def body(_: int, x: jax.Array) -> jax.Array:
@@ -224,7 +224,7 @@ def _most_operations(
 
 
 def million(samples: int = MILLION) -> dict[str, Any]:
-    """A sweep to disk that is killed and goes on, against one that is not."""
+    """A sweep to disk that is killed and resumed, compared with an uninterrupted one."""
     environment = {
         **os.environ,
         "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path]),
@@ -266,18 +266,17 @@ def million(samples: int = MILLION) -> dict[str, Any]:
         "identical": same,
     }
     print(
-        f"\n{samples:,} shapes to disk: {seconds:.1f} s with start and compiling, "
+        f"\n{samples:,} shapes to disk: {seconds:.1f} s including start-up and compilation, "
         f"{memory / 2**30:.2f} GiB at most; killed after {done:,}"
     )
     print(
-        f"the rest took {rest:.1f} s; what is on disk is "
-        f"{'the same to the bit' if same else 'NOT the same'}"
+        f"the rest took {rest:.1f} s; the stores are {'bit-identical' if same else 'NOT identical'}"
     )
     return row
 
 
 def draw(found: dict[str, list[dict[str, Any]]], path: str) -> None:
-    """A panel for each study."""
+    """One panel per study."""
     figure = Figure(figsize=(11, 6), layout="constrained")
     for ax, (name, rows) in zip(figure.subplots(2, 3).flat, found.items(), strict=True):
         names = [row["name"].removesuffix(f" {name}") for row in rows]
@@ -296,18 +295,18 @@ def draw(found: dict[str, list[dict[str, Any]]], path: str) -> None:
         else:
             ax.bar(names, rate[0], yerr=spread, color="#0072B2", capsize=3)
             ax.tick_params(axis="x", labelrotation=20 if name.startswith("precision") else 0)
-        ax.set(xlabel=name, ylabel="shapes a second")
+        ax.set(xlabel=name, ylabel="shapes per second")
         ax.grid(axis="y", alpha=0.3)
     figure.savefig(path, dpi=150)
 
 
 def main() -> None:
-    """All studies, the table, and what is asked for besides."""
+    """Runs all studies and the optional parts, and prints the results."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--json", type=Path, help="write the figures here too")
-    parser.add_argument("--plot", metavar="FILE", help="draw them")
+    parser.add_argument("--json", type=Path, help="also write the results to this file")
+    parser.add_argument("--plot", metavar="FILE", help="plot the rates")
     parser.add_argument(
         "--million", action="store_true", help="a million shapes to disk, killed once"
     )
@@ -329,7 +328,7 @@ def main() -> None:
         "{machine_flops:.2e} per second at most".format(**report["limit"]),
         end="",
     )
-    print(f": the fastest sweep does {share:.0%} of that")
+    print(f": the fastest sweep reaches {share:.0%} of that")
     if options.million:
         report["million"] = million()
     if options.json:

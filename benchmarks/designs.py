@@ -1,10 +1,10 @@
-"""Two designs: one thread that bends an arm into a given S, and two threads that lead the tip along
+"""Two designs: one thread that bends an arm into a given S, and two threads that move the tip along
 a straight line.
 
     pip install . && python benchmarks/designs.py [--out FOLDER]
 
-The arm is a nitinol wire with discs that guide the threads, in a plane. What is found is checked at
-200 points of the curve, and at 200 tensions between those of the design, by 64 steps.
+The arm is a nitinol wire with discs that guide the threads, in a plane. The results are checked at
+200 points of the curve, and at 200 tensions between those of the design, with 64 steps.
 """
 
 import argparse
@@ -29,7 +29,7 @@ LINE, REACH = 0.285, 0.05
 
 
 def arm(*heights: float) -> vsr.Scene:
-    """A nitinol wire with threads in its plane, at these heights [m] everywhere to begin with."""
+    """A nitinol wire with threads in its plane, initially at constant heights [m]."""
     wire = vsr.Rod(
         LENGTH, vsr.Circular(0.0007), vsr.Material(54e9, poisson=0.3), guide_radius=0.0101
     )
@@ -40,8 +40,8 @@ def arm(*heights: float) -> vsr.Scene:
 
 
 def s_curve(points: int) -> np.ndarray:
-    """Points [m] of a plane curve whose tangent turns to 69 degrees and back, evenly spaced by
-    length, shape (points, 3)."""
+    """Points [m] of a plane curve whose tangent turns to 69 degrees and back, evenly spaced along
+    its length, shape (points, 3)."""
     s = np.linspace(0, LENGTH, 20 * 200 + 1)
     angle = 0.6 * (1 - np.cos(2 * np.pi * s / LENGTH))
     xy = [
@@ -76,9 +76,9 @@ def follow_the_s() -> tuple[vsr.Design, dict[str, Any]]:
 
 
 def off_the_line(arms: vsr.objective.Arms) -> Any:
-    """Mean square distance of the tips from the line x = 0.285 m, and of the first and last from
-    its ends, by the arm's length; with a little against tensions that jump from one set to the
-    next."""
+    """Mean square distance of the tips from the line x = 0.285 m, plus that of the first and last
+    tip from its ends, relative to the arm's length; with a small penalty on tensions that jump
+    from one set to the next."""
     tips = arms.each(lambda eq: eq.tip[:2, 3]) / LENGTH
     ends = (tips[0, 1] + REACH / LENGTH) ** 2 + (tips[-1, 1] - REACH / LENGTH) ** 2
     jumps = jnp.mean(jnp.diff(arms.inputs[:, 1], n=2) ** 2)
@@ -114,7 +114,8 @@ def along_the_line() -> tuple[vsr.Design, dict[str, Any]]:
 
 
 def between(found: vsr.Design, number: int) -> np.ndarray:
-    """Tensions between those of the design: the second thread's by a spline over the first's."""
+    """Tensions between those of the design; that of the second thread is a spline over that of the
+    first."""
     first, second = np.asarray(found.inputs).T
     pulled = np.linspace(first[0], first[-1], number)
     spline = vsr.SplineProfile(first, second)
@@ -176,7 +177,7 @@ def draw(s: vsr.Design, line: vsr.Design, path: Path) -> None:
         linewidth=2.5,
         label="path of the tip",
     )
-    right.set_title("Two threads that lead the tip along a line")
+    right.set_title("Two threads that move the tip along a line")
     for ax in (left, right):
         ax.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
         ax.legend(frameon=False, loc="upper left", fontsize=9)
@@ -198,7 +199,7 @@ def main() -> None:
     (out / "designs.json").write_text(json.dumps(record, indent=1) + "\n")
     title = "One thread that bends the arm into an S"
     vsr.save(s.scene, out / "designed_s.toml", s.inputs[0], title)
-    title = "Two threads that lead the tip along a line"
+    title = "Two threads that move the tip along a line"
     vsr.save(line.scene, out / "designed_line.toml", line.inputs[0], title)
 
 

@@ -1,18 +1,18 @@
-"""A search for equilibria that are refused: ordinary scenes are drawn and solved, and an
-independent path looks for what was not found.
+"""Search for false failures: random ordinary scenes are solved, and an independent program searches
+for the equilibria of those that fail.
 
-For each draw that does not converge, load steps in NumPy (see `load_steps`), which share nothing
-with the package, follow the equilibrium from no load. Where they reach the end by stable
-equilibria, on two meshes, with the arm bent by a turn at most, the refusal is a false failure: it
-is printed and kept with all its numbers. Where stability is lost on the way the arm snaps, which
-counts apart. Of each draw that converges the same code starts from the shape that was returned and
-has to stay there, and with `--gradients` the derivative of the tip by the share of all loads and
-inputs has to be finite. Run it with
+For each draw that does not converge, load steps in NumPy (see `load_steps`), which share no code
+with the package, follow the equilibrium from zero load. If they reach the full load through stable
+equilibria, on two meshes, with the arm bent by one turn at most, the draw is a false failure: it is
+printed and stored with all its numbers. If stability is lost on the way, the arm snaps; such draws
+are counted separately. For each draw that converges the same code starts from the returned shape
+and has to stay there. With `--gradients` the derivative of the tip with respect to the share of all
+loads and inputs has to be finite. Run it with
 
     python benchmarks/false_failures.py --json benchmarks/results/false_failures.json
 
-`ordinary_scenes.built(STRUCTURES[case["structure"]], case["numbers"])` builds a case of that file
-again.
+`ordinary_scenes.built(STRUCTURES[case["structure"]], case["numbers"])` rebuilds a case of that
+file.
 """
 
 import argparse
@@ -46,10 +46,10 @@ except ModuleNotFoundError:  # as a script
 
 STEPS = 16
 A_TURN = 2 * math.pi
-"""How far an ordinary arm is bent at most [rad]."""
+"""Largest bending of an ordinary arm [rad]."""
 SAME = 0.02
-"""Largest distance of the tips of one equilibrium on two meshes, as a share of the length; `COARSE`
-is what a status promises."""
+"""Largest distance between the tips of one equilibrium on two meshes, as a share of the length;
+`COARSE` is the error that a converged status allows."""
 
 
 class Answer(NamedTuple):
@@ -63,7 +63,7 @@ class Answer(NamedTuple):
 
 @partial(jax.jit, static_argnums=0)
 def answers(structure: Structure, draws: dict[str, jax.Array]) -> Answer:
-    """Solutions of draws side by side."""
+    """Solutions of draws in a batch."""
 
     def answer(numbers: Numbers) -> Answer:
         eq = vsr.solve(*built(structure, numbers), model=vsr.StrainDependent(STEPS))
@@ -75,8 +75,8 @@ def answers(structure: Structure, draws: dict[str, jax.Array]) -> Answer:
 
 @partial(jax.jit, static_argnums=0)
 def slopes(structure: Structure, draws: dict[str, jax.Array]) -> jax.Array:
-    """Derivatives in reverse mode of a sum over the tip by the share of loads and inputs, which
-    calls for all adjoints of a solve."""
+    """Reverse-mode derivatives of the sum of the tip's coordinates with respect to the share of
+    loads and inputs; they need all adjoints of a solve."""
 
     def tip(share: jax.Array, numbers: Numbers) -> jax.Array:
         return jnp.sum(
@@ -89,12 +89,12 @@ def slopes(structure: Structure, draws: dict[str, jax.Array]) -> jax.Array:
 
 
 def drawn(structure: Structure, count: int, seed: int) -> list[Numbers]:
-    """The same draws each time; a longer list begins with a shorter one."""
+    """Reproducible draws; a longer list starts with the same draws as a shorter one."""
     return [structure.numbers(np.random.default_rng((seed, i))) for i in range(count)]
 
 
 def sought(structure: Structure, numbers: Numbers) -> tuple[str, dict[str, Any]]:
-    """What the independent path says of a draw that was refused, and where it ended."""
+    """Verdict of the independent path on a draw that failed, and where the path ended."""
     arm = load_steps.Arm(structure, numbers)
     path = arm.follow()
     turn, tip = arm.turn(path.strain), arm.tip(path.strain)
@@ -120,8 +120,8 @@ def sought(structure: Structure, numbers: Numbers) -> tuple[str, dict[str, Any]]
 
 
 def confirmed(structure: Structure, numbers: Numbers, answer: Answer) -> tuple[str, dict[str, Any]]:
-    """Whether a converged shape is what the independent code stays at, on a finer mesh where need
-    be, and how far the arm is bent."""
+    """Verdict on a converged shape: whether the independent code stays there, if necessary on a
+    finer mesh; and the bending of the arm."""
     L, record = numbers["length"], {}
     unit = numbers["young"] * np.pi * numbers["radius"] ** 4 / 4 / L**2
     for finer in (1, 4):
@@ -194,7 +194,7 @@ def search(name: str, count: int, seed: int, gradients: bool = False) -> dict[st
 
 
 def told(name: str, record: dict[str, Any]) -> None:
-    """Prints what came out."""
+    """Prints the verdicts on a structure."""
     verdicts = ", ".join(f"{count} {said}" for said, count in record["verdicts"].items())
     there = record["have a stable equilibrium"]
     print(
@@ -214,7 +214,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "--draws", type=int, default=200, help="of each structure (default: %(default)s)"
+        "--draws", type=int, default=200, help="draws per structure (default: %(default)s)"
     )
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument(
@@ -228,7 +228,7 @@ def main() -> None:
     parser.add_argument(
         "--gradients",
         action="store_true",
-        help="check them too, which takes three times as long to compile",
+        help="also check the gradients, which takes three times as long to compile",
     )
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)

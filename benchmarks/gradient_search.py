@@ -1,19 +1,19 @@
-r"""A search for gradients that are finite and wrong: forward mode, reverse mode and differences of
-the solve, on drawn scenes.
+r"""Search for gradients that are finite but wrong: forward mode, reverse mode and finite
+differences of the solve, on random scenes.
 
     python benchmarks/gradient_search.py --json benchmarks/results/gradients.json
 
-A structure is a subset of the effects below and where they act. Twelve are chosen so that any two
-effects occur together, one without the other, and neither, and of each seventeen scenes are drawn,
-whose numbers (sizes, moduli, base, rest strain, routings, loads, friction, inputs) are all random.
-A function f of the tip's pose, the forces found and the slack is differentiated by all numbers of
-scene and inputs at once, along a random direction v: in forward mode, in reverse mode (the gradient
-times v), and by fourth-order central differences of the solve. The three have to agree to 1e-7 of
-the derivative. NaN is no derivative, and counted apart; so are scenes without an equilibrium, whose
-derivatives have to be zero or NaN in both modes. A difference knows its own error from those of
-other step sizes. It counts only where the solve is smooth: points at which another cable is slack
-than at the centre, or steps are shared otherwise by the pieces of the arm, are left out, and a
-scene with too few points left is counted as at a switch.
+A structure is a subset of the effects below and where they act. Twelve structures are chosen so
+that for any two effects all four combinations of on and off occur. Seventeen scenes are drawn for
+each structure, with random sizes, moduli, base, rest strain, routings, loads, friction and inputs.
+A function f of the tip's pose, the thread forces and the slack is differentiated with respect to
+all numbers of scene and inputs, along a random direction v: in forward mode, in reverse mode (the
+gradient times v), and by fourth-order central differences of the solve. The three must agree to
+1e-7 of the derivative. NaN is counted separately; so are scenes without an equilibrium, whose
+derivatives must be zero or NaN in both modes. The error of a difference is estimated from those of
+other step sizes. Only points where the solve is smooth are used: points where other cables are
+slack than at the centre, or where the steps are distributed differently over the pieces of the arm,
+are left out. A scene with too few points left is counted as at a switch.
 """
 
 import argparse
@@ -42,7 +42,7 @@ SAME = 1e-7
 """Largest difference between two derivatives that count as the same, as a share of the
 derivative."""
 WIDEST, HALVINGS = 0.02, 10
-"""Largest step of the differences as a share of each number, and how often it is halved."""
+"""Largest step of the differences as a share of each number, and the number of halvings."""
 
 EFFECTS = (
     "gravity",
@@ -57,9 +57,9 @@ EFFECTS = (
     "jumps",
     "free strains",
 )
-"""Gravity, in a fluid; wrenches in space; wrenches that follow; friction of tendons that are
-pulled, released; tendons driven by their length, elastic ones; a chamber; sections and threads that
-end, wrenches on the way; only some of the strains free."""
+"""Gravity, in a fluid; dead wrenches; follower wrenches; friction of tendons that are pulled,
+released; tendons driven by their length, elastic ones; a chamber; piecewise sections, threads that
+end before the tip and wrenches between base and tip; only some of the strains free."""
 NEEDS = {"fluid": "gravity", "elastic": "length"}
 FREE = (
     ("bending_y", "bending_z"),
@@ -69,13 +69,12 @@ FREE = (
 
 
 def stream(effects: Iterable[str]) -> np.random.Generator:
-    """Random numbers that depend on the effects alone."""
+    """Random number generator seeded by the effects alone."""
     return np.random.default_rng([SEED, *(name in set(effects) for name in EFFECTS)])
 
 
 class Structure(NamedTuple):
-    """Effects, and on which of the two tendons those act that belong to a tendon; the strains that
-    are free."""
+    """Effects, the tendons on which `pull`, `release` and `length` act, and the free strains."""
 
     effects: tuple[str, ...]
     pull: tuple[int, ...]
@@ -85,7 +84,7 @@ class Structure(NamedTuple):
 
 
 def structure(effects: frozenset[str]) -> Structure:
-    """A subset of the effects, their places drawn, always the same ones."""
+    """The structure of a subset of the effects, with reproducible random places."""
     random = stream(effects)
     places = [((0,), (1,), (0, 1))[i] for i in random.integers(3, size=2)]
     pull, length = (
@@ -102,8 +101,8 @@ def structure(effects: frozenset[str]) -> Structure:
 
 
 def structures(number: int) -> list[Structure]:
-    """All effects together, and then the subset, of a hundred drawn, that adds most triples of
-    effects on or off."""
+    """All effects together, then repeatedly the one of a hundred random subsets that adds the most
+    on-off combinations of three effects."""
     random, seen = np.random.default_rng(SEED), set()
 
     def triples(effects: frozenset[str]) -> set:
@@ -127,7 +126,7 @@ def structures(number: int) -> list[Structure]:
 
 
 class _Arm(NamedTuple):
-    """Length [m], radius of the tip [m], and bending stiffness EI [N m^2] of a drawn arm."""
+    """Length [m], radius of the tip [m] and bending stiffness EI [N m^2] of an arm."""
 
     length: float
     radius: float
@@ -143,7 +142,7 @@ class Drawn(NamedTuple):
 
 
 def drawn(made: Structure, random: np.random.Generator) -> Drawn:
-    """A scene and its inputs, no number of which is zero."""
+    """A random scene and its inputs, without zeros."""
     on, uniform = set(made.effects), random.uniform
     L = uniform(0.2, 0.4)
     base, young = L / uniform(24, 50), 10 ** uniform(5.3, 6.3)
@@ -177,7 +176,7 @@ def drawn(made: Structure, random: np.random.Generator) -> Drawn:
 
 
 def _pull(arm: _Arm, random: np.random.Generator) -> float:
-    """Force [N] of a thread that bends the arm by some 0.2 to 1.5 radians."""
+    """Force [N] of a thread that bends the arm by about 0.2 to 1.5 radians."""
     return random.uniform(0.2, 1.5) * arm.bending / (arm.length * 0.6 * arm.radius)
 
 
@@ -245,8 +244,7 @@ def _loads(on: set[str], arm: _Arm, density: float, random: np.random.Generator)
 
 
 class Program:
-    """The functions of a structure's scenes that are compiled: f with its derivatives, and f
-    alone."""
+    """Compiled functions for the scenes of a structure: f, and its derivatives."""
 
     def __init__(self, like: Drawn, model: Any, random: np.random.Generator):
         _, rebuild = ravel_pytree(like[:2])
@@ -271,8 +269,8 @@ class Program:
 
 
 class Found(NamedTuple):
-    """Of one scene: its status, the three derivatives, and the error of the difference by its own
-    estimate (NaN at a switch)."""
+    """Results of one scene: its status, the three derivatives, and the estimated error of the
+    difference (NaN at a switch)."""
 
     status: int
     forward: float
@@ -282,7 +280,7 @@ class Found(NamedTuple):
 
 
 def search(made: Structure, draws: int, model: Any = None) -> list[Found]:
-    """Derivatives of drawn scenes of a structure, always the same scenes."""
+    """Derivatives of reproducible random scenes of a structure."""
     random = stream(made.effects)
     scenes = [drawn(made, random) for _ in range(draws)]
     program = Program(scenes[0], vsr.StrainDependent(STEPS) if model is None else model, random)
@@ -310,8 +308,11 @@ def search(made: Structure, draws: int, model: Any = None) -> list[Found]:
 
 def difference(odd: np.ndarray, steps: np.ndarray) -> tuple[float, float]:
     r"""Fourth-order central difference $(8 (f_h - f_{-h}) - (f_{2h} - f_{-2h})) / 12 h$ and its
-    error, from $f_h - f_{-h}$ at steps that are halved: where it differs least from those of twice
-    and of half the step, and four times what it differs by there."""
+    error, from $f_h - f_{-h}$ at successively halved steps.
+
+    The chosen step is the one whose difference is closest to those of twice and of half the step;
+    the error is four times that distance.
+    """
     slopes = (8 * odd[1:] - odd[:-1]) / (12 * steps[1:])
     changes = np.abs(np.diff(slopes))
     errors = np.maximum(changes[1:], changes[:-1])
@@ -322,7 +323,7 @@ def difference(odd: np.ndarray, steps: np.ndarray) -> tuple[float, float]:
 
 
 def verdict(found: Found) -> str:
-    """How a draw ended: in words, `wrong` where a derivative is."""
+    """Verdict on a draw; it starts with `wrong` if a derivative is wrong."""
     nan = np.isnan(found.forward), np.isnan(found.reverse)
     if found.status != vsr.Status.CONVERGED:
         none = all(nan) or found.forward == found.reverse == 0
@@ -391,13 +392,13 @@ def main() -> None:
     )
     parser.add_argument("--structures", type=int, default=12)
     parser.add_argument(
-        "--draws", type=int, default=17, help="of each structure (default: %(default)s)"
+        "--draws", type=int, default=17, help="draws per structure (default: %(default)s)"
     )
     parser.add_argument(
         "--prescribed",
         type=int,
         default=2,
-        help="how many of the structures to solve in a basis too (default: %(default)s)",
+        help="structures to solve also in a prescribed basis (default: %(default)s)",
     )
     parser.add_argument("--json", metavar="FILE")
     options = parser.parse_args()

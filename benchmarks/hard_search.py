@@ -1,13 +1,13 @@
-"""A search for shapes that are called solutions and are not: hypothesis draws arms of all sizes,
-threads, loads and forces.
+"""Search for wrong shapes with a converged status: hypothesis draws arms of all sizes, threads,
+loads and forces.
 
-Of each that converges, code that shares nothing with the package but the numbers of the scene works
-out the residual from the strains; the gradient has to be finite; and twice the steps have to give
-the same shape. What does not converge has to say why and to come as NaN. Run it with
+For each solve that converges, independent code computes the residual from the strains and the
+numbers of the scene; the gradient must be finite; and a solve with twice the steps must give the
+same shape. A solve that fails must have a status and return NaN. Run it with
 
     python benchmarks/hard_search.py --json benchmarks/results/hard_search.json
 
-The tests run two hundred, on threads alone.
+The tests run two hundred examples, with threads alone.
 """
 
 import argparse
@@ -28,19 +28,20 @@ from vsr_jax.mechanics.resolution import COARSE
 
 STEPS = 16
 SAME = COARSE
-"""Largest distance of the tips of a solve and of one with twice the steps, as a share of the
-length: what a status promises."""
+"""Largest distance between the tips of a solve and of one with twice the steps, as a share of the
+length: the error that a converged status allows."""
 BALANCED = 1e-9, 0.05
-"""Largest imbalance as a share of the wrenches: of threads alone, by rounding; with loads, which
-the steps carry along the arm."""
+"""Largest imbalance as a share of the wrenches: for threads alone, due to rounding; with loads, due
+to the steps along the arm."""
 STATIONS = 401
 
 
 class Draw(NamedTuple):
-    """An arm in numbers without unit, besides its length [m] and modulus [Pa]: length by diameter,
-    radius of the tip by that of the base, curvature at rest by 1 / L, threads (place by radius,
-    phase, turns), forces by $EI / (L d)$ or EA, weight $\\rho g A L^3 / EI$, direction of gravity,
-    force and moment at the tip by $EI / L^2$ and $EI / L$."""
+    """An arm in dimensionless numbers, except for its length [m] and modulus [Pa]: ratio of length
+    to diameter, ratio of the radii of tip and base, curvature at rest in units of 1 / L, threads
+    (place relative to the radius, phase, turns), forces in units of $EI / (L d)$ or EA, weight
+    $\\rho g A L^3 / EI$, direction of gravity, force and moment at the tip in units of $EI / L^2$
+    and $EI / L$."""
 
     length: float
     young: float
@@ -58,12 +59,12 @@ class Draw(NamedTuple):
 
 
 def powers(low: float, high: float) -> st.SearchStrategy[float]:
-    """Numbers over many orders of magnitude, by their exponent of ten."""
+    """Powers of ten with exponents between two bounds."""
     return st.floats(low, high).map(lambda exponent: 10.0**exponent)
 
 
 def signed(low: float, high: float) -> st.SearchStrategy[float]:
-    """The same with either sign, or zero."""
+    """Powers of ten with either sign, or zero."""
     return st.one_of(st.just(0.0), powers(low, high), powers(low, high).map(lambda x: -x))
 
 
@@ -123,8 +124,8 @@ def built(draw: Draw) -> tuple[vsr.Scene, np.ndarray]:
 
 
 class Answer(NamedTuple):
-    """Status, tip [m] and strains at the stations of a solve, the gradient of its tip; status and
-    tip with twice the steps."""
+    """Status, tip [m], strains at the stations and gradient of the tip of a solve; status and tip
+    with twice the steps."""
 
     status: np.ndarray
     tip: np.ndarray
@@ -149,7 +150,7 @@ def answer(scene: vsr.Scene, forces: jax.Array) -> Answer:
 
 
 def rotation(k: np.ndarray) -> np.ndarray:
-    """Rotation by a vector, after Rodrigues."""
+    """Rotation matrix of a rotation vector, by Rodrigues' formula."""
     angle = math.sqrt(k @ k)
     K = np.array([[0, -k[2], k[1]], [k[2], 0, -k[0]], [-k[1], k[0], 0]])
     a, b = (
@@ -212,7 +213,7 @@ def residual(draw: Draw, forces: np.ndarray, strain: np.ndarray) -> float:
 
 
 def reaction(draw: Draw, strain: np.ndarray) -> np.ndarray:
-    """What the loads beyond each station ask of it, in its frame."""
+    """Internal wrench at each station that balances the loads beyond it, in the body frame."""
     L, base = draw.length, draw.length / (2 * draw.slenderness)
     bending = draw.young * math.pi * base**4 / 4
     R, r = shape(strain, L)
@@ -237,7 +238,7 @@ def reaction(draw: Draw, strain: np.ndarray) -> np.ndarray:
 
 
 def verdict(draw: Draw) -> str:
-    """How a draw ended: the status in words, or what is wrong with what was called converged."""
+    """Verdict on a draw: the name of its status, or the fault of a converged solve."""
     scene, forces = built(draw)
     found = jax.tree.map(np.asarray, answer(scene, jnp.asarray(forces)))
     status = vsr.Status(int(found.status))
@@ -256,8 +257,7 @@ def verdict(draw: Draw) -> str:
 
 
 def search(examples: int, loaded: bool) -> tuple[Counter, list[tuple[str, Draw]]]:
-    """Verdicts of many draws, the same ones each time, and the draws that went wrong or are in
-    doubt."""
+    """Verdicts on reproducible random draws, and the draws that are wrong or in doubt."""
     counts, wrong = Counter(), []
 
     @settings(
@@ -279,18 +279,18 @@ def search(examples: int, loaded: bool) -> tuple[Counter, list[tuple[str, Draw]]
 
 
 def main() -> None:
-    """Searches without and with loads, and says what came out."""
+    """Searches without and with loads, and prints the verdicts."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "--examples", type=int, default=10_000, help="on threads alone (default: %(default)s)"
+        "--examples", type=int, default=10_000, help="with threads alone (default: %(default)s)"
     )
     parser.add_argument(
         "--loaded",
         type=int,
         default=1_000,
-        help="with loads, each some forty times slower (default: %(default)s)",
+        help="with loads, each about forty times slower (default: %(default)s)",
     )
     parser.add_argument("--json", metavar="FILE")
     options = parser.parse_args()

@@ -1,14 +1,13 @@
-"""Whether error estimates are honest and tolerances are met: 200 arms drawn at random, with a fixed
-seed.
+"""Reliability of error estimates and tolerances on 200 random arms, with a fixed seed.
 
     pip install . && python benchmarks/honest_errors.py [--scenes 50] [--json FILE]
 
 Four kinds of arms, each drawn 50 times: one helical thread; a helix and an oblique thread; a
 polynomial and a straight thread; a helix under gravity with a force and a moment at the tip.
 Length, taper, modulus, routing, forces and loads are drawn. True errors are distances of the tip to
-a solution of 160 steps (96 under loads); those below the rounding that an estimate never goes below
-are counted apart. The tolerance of each arm is drawn between a hundredth and a ten-millionth of its
-length; what `solve(..., tolerance=...)` chooses for it is then solved and compared.
+a solution of 160 steps (96 under loads); errors at the level of rounding are counted separately.
+The tolerance of each arm is drawn between 1e-7 and 1e-2 of its length; the error of
+`solve(..., tolerance=...)` is compared with it.
 """
 
 import argparse
@@ -30,7 +29,7 @@ import vsr_jax as vsr
 
 SEED = 6
 ROUNDED = 1e-11
-"""Tip error, as a share of the length, below which only rounding is left."""
+"""Tip error, as a share of the length, below which only rounding remains."""
 MODELS = {
     "8 steps": vsr.StrainDependent(8),
     "16 steps": vsr.StrainDependent(16),
@@ -132,7 +131,7 @@ def draw(kind: str, number: int, random: np.random.Generator) -> Drawn:
 def tips(
     drawn: Drawn, model: vsr.StrainDependent | vsr.Prescribed, *, error: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Place of each tip [m], and the estimated error."""
+    """Position of each tip [m], and the estimated error."""
 
     def of(scene: vsr.Scene, inputs: jax.Array) -> tuple[jax.Array, jax.Array]:
         eq = vsr.solve(scene, inputs, model=model)
@@ -143,8 +142,8 @@ def tips(
 
 
 def study(kind: str, number: int, random: np.random.Generator) -> dict[str, Any]:
-    """Ratios of estimated to true errors by model, and how the errors at the chosen steps compare
-    with the tolerances."""
+    """Ratios of estimated to true errors by model, and ratios of the errors at the chosen steps to
+    the tolerances."""
     drawn = draw(kind, number, random)
     exact, _ = tips(
         drawn, vsr.StrainDependent(96 if kind == "helix under loads" else 160), error=False
@@ -184,7 +183,7 @@ def _tolerances(drawn: Drawn, exact: np.ndarray) -> dict[str, Any]:
 
 
 def summary(results: dict[str, Any]) -> list[str]:
-    """The figures in words."""
+    """The results as lines of text."""
     text = []
     for name in MODELS:
         rows = [kind["estimates"][name] for kind in results.values()]
@@ -211,7 +210,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--scenes", type=int, default=50, help="of each kind")
+    parser.add_argument("--scenes", type=int, default=50, help="scenes of each kind")
     parser.add_argument("--json", metavar="FILE")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)

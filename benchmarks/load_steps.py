@@ -1,23 +1,23 @@
-r"""An independent path to a stable equilibrium: load steps from no load with Newton's method on a
+r"""Independent search for a stable equilibrium: load steps from zero load with Newton's method on a
 dense system, in NumPy alone.
 
-It shares nothing with the package but the numbers of a scene (see `ordinary_scenes`). The arm is N
-elements of one strain each; lengths are in units of L and forces in $EI / L^2$ of the base. In
-balance is, at the middle of each element,
+It shares no code with the package, only the numbers of a scene (see `ordinary_scenes`). The arm
+consists of N elements of constant strain; lengths are in units of L and forces in units of
+$EI / L^2$ of the base. The residual at the middle of each element is
 
 $$r_i = \Sigma (\xi_i - \xi^*) - B \tau_i - Ad(g_i)^T W_i,$$
 
-with $W_i$ the loads beyond, as wrenches about the origin of space. A change of strain moves all
-that lies beyond by the twist $h\,Ad(g_i)\,\delta\xi_i$; so the tangent is known in closed form, to
-second order in h, and dense. Tendons driven by length add their tension as an unknown and $\min(T,
-s) = 0$ as an equation, with s their slack. Friction takes the shares of the last iterate.
+with $W_i$ the loads beyond, as wrenches about the world origin. A change of strain moves all
+elements beyond by the twist $h\,Ad(g_i)\,\delta\xi_i$; the tangent is thus dense and known in
+closed form, to second order in h. Each tendon driven by length adds its tension as an unknown and
+$\min(T, s) = 0$ as an equation, with s its slack. Friction uses the shares of the last iterate.
 
-Stability is that of an arm whose curvature and twist creep in proportion to their stiffness, all
-else in balance: by the eigenvalues of the scaled tangent. A path ends where a real one ceases to be
-positive: there the arm snaps. Pairs of complex ones with a negative real part, which only loads
-without potential can make (follower wrenches, dead moments in space, friction), are flutter. A step
-that turns the arm by more than `MOST_TURN` is halved, so that the path leads from one equilibrium
-to its neighbour.
+Stability refers to an arm whose curvature and twist creep at a rate set by their stiffness, with
+all other unknowns in balance; it is determined by the eigenvalues of the scaled tangent. A path
+ends where a real eigenvalue becomes zero or negative: there the arm snaps. Complex pairs with a
+negative real part mean flutter; only loads without a potential (follower wrenches, dead moments in
+space) and friction cause them. A step that turns the arm by more than `MOST_TURN` is halved, so
+that the path does not skip to another equilibrium.
 """
 
 from typing import Any, NamedTuple
@@ -26,24 +26,25 @@ import numpy as np
 
 ELEMENTS = 48
 MOST_TURN = 0.6
-"""How far [rad] one load step may turn the arm in all."""
+"""Largest total turn [rad] of the arm in one load step."""
 FIRST_STEP, LEAST_STEP = 0.1, 2e-4
 MOST_ITERATIONS = 25, 100
-"""Without friction, and with it, whose shares converge more slowly."""
+"""Without friction, and with friction, whose shares converge more slowly."""
 BALANCED = 1e-7
 """Energy norm of a Newton step that counts as rounding, in $\\sqrt{EI / L}$."""
 
 
 class Margin(NamedTuple):
-    """Least real eigenvalue of the scaled tangent, and least real part of all: 1 at rest."""
+    """Least real eigenvalue of the scaled tangent, and least real part of all eigenvalues; both are
+    1 at rest."""
 
     real: float
     all: float
 
 
 class Path(NamedTuple):
-    """Where a path ended: the share of loads and inputs reached, stability margin there, the least
-    real one on the way, and strains and tensions of the cables."""
+    """End of a path: the share of loads and inputs reached, the stability margin there, the least
+    real margin on the path, and the strains and cable tensions."""
 
     share: float
     margin: Margin
@@ -53,12 +54,12 @@ class Path(NamedTuple):
 
     @property
     def arrived(self) -> bool:
-        """Whether all of the loads are carried without a snap on the way."""
+        """Whether the path reaches the full load without a snap."""
         return self.share == 1 and self.least > 0
 
 
 class Arm:
-    """A draw in numbers without unit, on N elements."""
+    """A draw in dimensionless numbers, on N elements."""
 
     def __init__(self, structure: Any, numbers: dict[str, Any], elements: int = ELEMENTS):
         n = {name: np.asarray(value) for name, value in numbers.items()}
@@ -78,8 +79,8 @@ class Arm:
         self._wrenches(structure, n, L, bending, area)
 
     def _threads(self, structure: Any, n: dict[str, Any], L: Any, bending: Any) -> None:
-        """Places of the tendons in the sections, how much of each element they run through, inputs,
-        friction, elasticity."""
+        """Sets up the tendons: positions in the sections, share of each element that they cover,
+        inputs, friction, elasticity."""
         tendons, X = structure.tendons, self.middle
         self.paths = []
         for i in range(len(tendons)):
@@ -110,8 +111,8 @@ class Arm:
     def _wrenches(
         self, structure: Any, n: dict[str, Any], L: Any, bending: Any, area: np.ndarray
     ) -> None:
-        """Each load as (element, how much of it lies before the load, moment, force, whether it
-        follows)."""
+        """Sets up the loads, each as (element, share of the element before the load, moment, force,
+        whether it is a follower load)."""
         self.loads = []
         unit = bending / L**2
         if structure.gravity:
@@ -137,11 +138,11 @@ class Arm:
         self.follows = np.array([load[4] for load in self.loads], bool)
         gap = self.element[None] - np.arange(self.count)[:, None]
         self.beyond = np.where(gap > 0, 1.0, np.where(gap == 0, self.before[None], 0.0))
-        """How much of each element (row) lies before each load (column)."""
+        """Share of each element (row) that lies before each load (column)."""
 
     def _tangent(self, xi: np.ndarray, i: int) -> tuple[np.ndarray, np.ndarray]:
-        """Unit tangent of a thread in the sections' frames, and the length of its path per length
-        of the arm."""
+        """Unit tangent of a thread in the body frames, and the length of its path per length of the
+        arm."""
         d, slope = self.paths[i]
         t = np.cross(xi[:, :3], d) + xi[:, 3:] + slope
         size = np.linalg.norm(t, axis=1)
@@ -160,7 +161,7 @@ class Arm:
     def system(
         self, xi: np.ndarray, tension: np.ndarray, s: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Residual (6 N + cables) and its derivative."""
+        """Residual, shape (6 N + cables,), and its derivative."""
         N, h = self.count, self.h
         ends, middle = self.poses(xi)
         A = _adjoint(middle)
@@ -200,7 +201,8 @@ class Arm:
     def _cable(
         self, i: int, T: float, s: float, share: np.ndarray, size: np.ndarray, B: np.ndarray
     ) -> tuple:
-        """Equation of a cable, and its derivatives by the strain and by its tension."""
+        """Equation of a cable, and its derivatives with respect to the strain and to its
+        tension."""
         reach, given = self.reach[i], self.rest_length[i] + s * self.inputs[i]
         mean = np.sum(share) / np.sum(reach)
         slack = given * (1 + T * mean * self.compliance[i]) - np.sum(self.h * reach * size)
@@ -211,7 +213,7 @@ class Arm:
         return scale * slack, scale * by_strain, scale * given * mean * self.compliance[i]
 
     def _share(self, t: np.ndarray, middle: np.ndarray, i: int) -> np.ndarray:
-        """Share of a tendon's force at the middle of each element, after the capstan equation."""
+        """Share of a tendon's force at the middle of each element, by the capstan equation."""
         if not self.friction[i]:
             return self.reach[i]
         t = np.einsum("nij,nj->ni", middle[:, :3, :3], t)
@@ -222,8 +224,8 @@ class Arm:
         return self.reach[i] * np.exp(-self.friction[i] * np.cumsum(np.concatenate([first, angle])))
 
     def _carried(self, xi: np.ndarray, ends: np.ndarray, s: float) -> tuple[np.ndarray, ...]:
-        """Wrench beyond the middle of each element about the origin, what its frame's twist makes
-        of it, and its derivative by twists."""
+        """Wrench about the origin of the loads beyond the middle of each element, its change by the
+        twist of its frame, and its derivatives with respect to twists."""
         N = self.count
         if not len(self.element):
             return np.zeros((N, 6)), *(np.zeros((N, 6, 6)) for _ in range(3))
@@ -244,7 +246,8 @@ class Arm:
         return W, _turned(W), C, diagonal
 
     def margin(self, J: np.ndarray) -> Margin:
-        """Stability from the tangent by curvature and twist, with all else in balance."""
+        """Stability margin from the tangent with respect to curvature and twist, with all other
+        unknowns in balance."""
         bent = np.arange(6 * self.count).reshape(-1, 6)[:, :3].reshape(-1)
         others = np.setdiff1d(np.arange(len(J)), bent)
         K = J[np.ix_(bent, bent)] - J[np.ix_(bent, others)] @ np.linalg.solve(
@@ -253,7 +256,7 @@ class Arm:
         root = np.sqrt(self.h * self.stiffness[:, :3].reshape(-1))
         K = K / (root[:, None] * root)
         least = np.linalg.eigvalsh(0.5 * (K + K.T))[0]
-        if least > 0:  # then so are the real parts of all
+        if least > 0:  # then all eigenvalues have positive real parts
             return Margin(float(least), float(least))
         values = np.linalg.eigvals(K)
         return Margin(
@@ -264,7 +267,7 @@ class Arm:
         self, xi: np.ndarray, tension: np.ndarray, s: float
     ) -> tuple[np.ndarray, np.ndarray, Margin] | None:
         """Strains, tensions and stability margin of the equilibrium near a start; None if Newton's
-        method does not get there."""
+        method does not converge."""
         size = 6 * self.count
         weight = np.sqrt(self.h * self.stiffness)
         for _ in range(MOST_ITERATIONS[any(self.friction)]):
@@ -284,7 +287,7 @@ class Arm:
         return None
 
     def follow(self) -> Path:
-        """Load steps from rest to all of the loads and inputs, or as far as they lead."""
+        """Load steps from rest to the full loads and inputs, or as far as they converge."""
         xi, tension = self.rest.copy(), np.zeros(len(self.driven))
         s, step, margin, least, last = 0.0, FIRST_STEP, Margin(1.0, 1.0), 1.0, (xi, tension, 0.0)
         while s < 1 and least > 0 and step > LEAST_STEP:
@@ -303,16 +306,16 @@ class Arm:
         return Path(s, margin, least, xi, tension)
 
     def tip(self, xi: np.ndarray) -> np.ndarray:
-        """Position of the tip [1 / L]."""
+        """Position of the tip, in units of L."""
         return self.poses(xi)[0][-1, :3, 3]
 
     def turn(self, xi: np.ndarray) -> float:
-        """How far the arm is bent in all [rad]."""
+        """Total bending of the arm [rad]."""
         return float(np.sum(np.linalg.norm((xi - self.rest)[:, 1:3], axis=1)) * self.h)
 
 
 def _lower(count: int) -> np.ndarray:
-    """Which entries of the tangent belong to an element and one before it."""
+    """Mask of the entries of the tangent that belong to an element and an earlier one."""
     place = np.repeat(np.arange(count), 6)
     return place[:, None] > place
 
@@ -331,13 +334,13 @@ def _adjoint(g: np.ndarray) -> np.ndarray:
 
 
 def _turned(w: np.ndarray) -> np.ndarray:
-    """The matrix that makes of a twist what it does to a wrench, $ad(\\eta)^T w$."""
+    """Matrix that maps a twist to the change of a wrench, $ad(\\eta)^T w$."""
     M, F = _skew(w[:, :3]), _skew(w[:, 3:])
     return np.concatenate([np.concatenate([M, F], 2), np.concatenate([F, 0 * F], 2)], 1)
 
 
 def _exp(x: np.ndarray) -> np.ndarray:
-    """Poses of twists, after Rodrigues."""
+    """Poses of twists, by Rodrigues' formula."""
     k, u = x[:, :3], x[:, 3:]
     square = np.sum(k**2, 1)[:, None, None]
     angle = np.sqrt(np.maximum(square, 1e-16))

@@ -1,10 +1,10 @@
-"""Scenes of an ordinary size, drawn at random: what a solver should never refuse while they have a
-stable equilibrium.
+"""Random scenes of ordinary size, which a solver should solve whenever they have a stable
+equilibrium.
 
-A `Structure` says what a scene has: tendons (by tension or length, elastic or not, with friction,
-ending on the way) and loads. It is static: all draws of a structure are solved by one compiled
-program. A draw is a dictionary of numbers in SI units, each a float or a list, that `built` turns
-into a scene and its inputs; a copy of the dictionary is all that a test needs.
+A `Structure` defines the tendons of a scene (driven by tension or length, elastic or not, with
+friction, ending before the tip) and its loads. It is static: all draws of a structure are solved by
+one compiled program. A draw is a dictionary of numbers in SI units, each a float or a list, that
+`built` turns into a scene and its inputs. A test only needs a copy of the dictionary.
 
 Sizes: $L / r$ from 10 to 3000; taper to half the radius; curved at rest in half of the draws;
 weight $\\rho g A L^3 / EI$ up to 30 in any direction; forces up to $10\\,EI / L^2$, moments up to
@@ -23,16 +23,16 @@ import vsr_jax as vsr
 Numbers = dict[str, Any]
 DENSITY = 1000.0
 PARALLEL = 1e-9
-"""Turns of a helix that is a parallel."""
+"""Turns of a helix that stands for a parallel path."""
 MOST_WEIGHT, MOST_FORCE, MOST_MOMENT = 30.0, 10.0, 5.0
 MOST_BEND = np.pi
 COLLAPSE_SHARE = 0.2
-"""Largest share that the tensions have of those at which the tip's section collapses."""
+"""Largest tensions, as a share of those at which the section at the tip collapses."""
 
 
 class Laid(NamedTuple):
-    """A tendon of a structure, or a chamber: how it is driven, whether it is elastic, rubs, winds
-    or ends before the tip."""
+    """A tendon of a structure, or a chamber: how it is driven, and whether it is elastic, has
+    friction, is helical or ends before the tip."""
 
     control: Literal["tension", "length", "pressure"] = "tension"
     elastic: bool = False
@@ -42,8 +42,8 @@ class Laid(NamedTuple):
 
 
 class Structure(NamedTuple):
-    """What a scene has: tendons; gravity; wrenches by name, see `_loads`; and how its numbers are
-    drawn."""
+    """Structure of a scene: tendons; gravity; wrenches by name, see `_loads`; and the function that
+    draws its numbers."""
 
     tendons: tuple[Laid, ...] = ()
     gravity: bool = False
@@ -56,7 +56,7 @@ class Structure(NamedTuple):
 
 
 def built(structure: Structure, numbers: Numbers, share: Any = 1.0) -> tuple[vsr.Scene, Any]:
-    """Scene and inputs of a draw, loads and inputs times `share`."""
+    """Scene and inputs of a draw, with loads and inputs scaled by `share`."""
     n = {name: jnp.asarray(value) for name, value in numbers.items()}
     section = vsr.Circular(vsr.Taper(n["radius"], n["tip_radius"]))
     material = vsr.Material(n["young"], poisson=n["poisson"], density=DENSITY)
@@ -130,7 +130,7 @@ def ordinary(structure: Structure, random: np.random.Generator) -> Numbers:
 
 
 def _tendons(structure: Structure, random: np.random.Generator, numbers: Numbers) -> Numbers:
-    """Where the tendons lie and how they are driven."""
+    """Numbers of the tendons: routings, stiffness, friction and inputs."""
     count, length, taper = (
         len(structure.tendons),
         numbers["length"],
@@ -152,8 +152,8 @@ def _tendons(structure: Structure, random: np.random.Generator, numbers: Numbers
     share = np.minimum(1.0, 2.0 / count)
     tension = random.random(count) * share * np.minimum(MOST_BEND * bend, COLLAPSE_SHARE * collapse)
     driven = np.array([laid.control == "length" for laid in structure.tendons])
-    # lengths of an arm bent in one plane, each drawn in or let out a little besides, by no more
-    # than the tension above stretches it
+    # lengths for an arm bent in one plane, each with a small random change, limited to the stretch
+    # under the tension above
     angle, plane = MOST_BEND * random.random(), random.uniform(0, 2 * np.pi)
     wound = np.where(winds, 0.3, 1.0)
     more = np.minimum(
@@ -176,7 +176,7 @@ def _tendons(structure: Structure, random: np.random.Generator, numbers: Numbers
 
 def catheter(structure: Structure, random: np.random.Generator) -> Numbers:
     """A stiff slender catheter with four tendons near its wall, 0 to 3 N each, and 0.5 N at the tip
-    in any direction."""
+    in a random direction."""
     return plain(
         {
             "length": 0.2,
@@ -197,8 +197,8 @@ def catheter(structure: Structure, random: np.random.Generator) -> Numbers:
 
 
 def upright(structure: Structure, random: np.random.Generator) -> Numbers:
-    """A silicone arm upright under its weight, from half to some times what its modulus can bear,
-    its chamber at no pressure."""
+    """An upright silicone arm with a weight from half to several times its buckling load, and a
+    chamber at zero pressure."""
     gravity = np.array([-9.81, 0.0, 0.0])
     return plain(
         {
@@ -225,7 +225,7 @@ def _direction(random: np.random.Generator) -> np.ndarray:
 
 
 def plain(numbers: Numbers) -> Numbers:
-    """The numbers as floats and lists, as JSON keeps them."""
+    """The numbers as floats and lists, which JSON can store."""
     return {name: np.asarray(value, float).tolist() for name, value in numbers.items()}
 
 

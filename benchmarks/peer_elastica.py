@@ -1,10 +1,10 @@
-"""PyElastica's side of bench_peers: dynamics with damping, run until the arm is at rest, as its
-users find statics.
+"""PyElastica in `bench_peers`: damped dynamics until the arm is at rest, the usual way to obtain a
+static solution with PyElastica.
 
-PyElastica has no tendons. The thread is a polygon through one point of each element and its ends;
-its force pulls at each point along both neighbouring sides, half on each node of the element, and
-turns the element by its arm. The shear stiffness is that of the other tools, without the factor
-27/28 that PyElastica puts in.
+PyElastica has no tendons. The thread is a polygon through one point per element and the two ends.
+At each point its force acts along both adjacent sides, half on each node of the element, with the
+torque of its lever arm on the element. The shear stiffness is that of the other tools, without
+PyElastica's factor of 27/28.
 """
 
 from typing import Any
@@ -14,7 +14,7 @@ import numpy as np
 
 
 class Pull(ea.NoForces):
-    """Tension T [N] of a thread at the places d of the elements, shape (3, elements), in their
+    """Tension T [N] of a thread at the positions d in the elements, shape (3, elements), in their
     frames."""
 
     def __init__(self, tension: float, places: np.ndarray):
@@ -41,7 +41,7 @@ class Pull(ea.NoForces):
 
 
 class Scene(ea.BaseSystemCollection, ea.Constraints, ea.Forcing, ea.Damping):
-    """What PyElastica integrates."""
+    """The system that PyElastica integrates."""
 
 
 def tip(
@@ -52,8 +52,8 @@ def tip(
     density: float = 1000.0,
     damping: float = 1.5,
 ) -> np.ndarray:
-    """Position of the tip [m] when the arm has had `seconds` to come to rest; its density only sets
-    the clock."""
+    """Position of the tip [m] after `seconds` of simulated time; the density only sets the time
+    scale."""
     length, radius, helix = scene["length"], scene["radius"], scene["helix"]
     rod = ea.CosseratRod.straight_rod(
         elements,

@@ -1,4 +1,4 @@
-"""The scenes of bench_peers in plain numbers, with the settings at which each tool solves them."""
+"""The scenes of `bench_peers` as plain numbers, with the settings of each tool."""
 
 from typing import Any, NamedTuple
 
@@ -20,8 +20,8 @@ _B1: dict[str, Any] = {
 
 
 class Case(NamedTuple):
-    """A scene: what it is, its numbers; steps and order for vsr_jax; settings for SoRoMoX, from
-    rough to fine; a tension and the tip there by an independent program."""
+    """A scene: description and numbers; steps and orders for vsr_jax; settings for SoRoMoX, from
+    coarse to fine; a tension, and the tip there from an independent program."""
 
     about: str
     numbers: dict[str, Any]

@@ -1,10 +1,9 @@
-"""SciPy's side of bench_peers: the continuous model by `scipy.integrate.solve_bvp`, as one writes
-it by hand.
+"""SciPy in `bench_peers`: the continuous model by `scipy.integrate.solve_bvp`, written by hand.
 
-State along the arm: position, unit quaternion, and in space the force and the moment in a section.
-The strain follows from the balance of each section by Newton's method. Clamped at the base, the
-given force at the tip, straight at the start; where that fails, the tension comes in five equal
-shares, each solution the start of the next.
+The state along the arm is the position, the unit quaternion, and the internal force and moment in
+the world frame. The strain follows from the balance of each section by Newton's method. The base is
+clamped, the force at the tip is given, and the initial guess is straight. If the solve fails, the
+tension is increased in five equal steps, each starting from the previous solution.
 """
 
 from typing import Any
@@ -14,7 +13,7 @@ from scipy.integrate import solve_bvp
 
 
 class Arm:
-    """The arm of a scene of `bench_peers` in numbers."""
+    """Numbers of an arm of `bench_peers`."""
 
     def __init__(self, scene: dict[str, Any]):
         area = np.pi * scene["radius"] ** 2
@@ -35,7 +34,7 @@ class Arm:
         self.tip_force = np.array(scene["tip_force"] or (0.0, 0.0, 0.0))
 
     def thread(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where the thread crosses the sections, and its slope, shape (n, 3)."""
+        """Position of the thread in the sections, and its slope, shapes (n, 3)."""
         radius, rate = (
             self.helix["radius"],
             1 / (self.helix["radius"] * np.tan(self.helix["angle"])),
@@ -89,7 +88,7 @@ class Arm:
         return np.concatenate([tangent, turning, weight, -np.cross(tangent, force)], 1).T
 
     def tip(self, tau: float, tol: float) -> np.ndarray:
-        """Position of the tip [m], NaN where `solve_bvp` gives up."""
+        """Position of the tip [m], NaN if `solve_bvp` fails."""
         X = np.linspace(0, self.length, 21)
         start = np.zeros((13, len(X)))
         start[0], start[3] = X, 1.0

@@ -1,23 +1,24 @@
-"""SoRoMoX's side of bench_peers: an arm as the minimum of an energy put together from SoRoMoX's own
+"""SoRoMoX in `bench_peers`: equilibrium as the minimum of an energy built from SoRoMoX's own
 functions.
 
 SoRoMoX (0.5) has no static solver. Its authors' scripts solve K q + G(q) = A(q) u by Newton's
-method from q = 0; that is one of the rows for arms without loads, and diverges on the loaded arm
-B1, which is far softer than its loads. `FORMULATIONS` keeps what else was tried. The fastest by
-far, and the one used:
+method from q = 0. This is one of the rows for arms without loads; it diverges on the loaded arm B1,
+which is very soft relative to its loads. `FORMULATIONS` lists the other formulations that were
+tried. The one used is the fastest by far:
 
-- one energy in place of the assembled forces: elastic energy, plus tension times path length, minus
-  the work of the loads. Its reverse-mode gradient costs about three runs of the kinematics, the
-  forces a recurrence of Jacobians;
-- coordinates whitened by the Cholesky factor of SoRoMoX's stiffness matrix, in which BFGS with
-  steps of length one is there after 10 to 15 gradients, without a Hessian or load steps;
-- kinematics with all cells side by side and only the product of their steps in a scan (`cells`).
-  SoRoMoX's own does it all cell after cell and takes up to twice as long.
+- an energy instead of the assembled forces: elastic energy, plus tension times path length, minus
+  the work of the loads. Its reverse-mode gradient costs about three evaluations of the kinematics;
+  the forces need a recurrence of Jacobians;
+- coordinates whitened by the Cholesky factor of SoRoMoX's stiffness matrix, in which BFGS with unit
+  steps converges after 10 to 15 gradients, without a Hessian or load steps;
+- kinematics that evaluate all cells in a batch, with only the product of their steps in a scan
+  (`cells`). SoRoMoX's own kinematics scan over the cells and take up to twice as long.
 
-Conventions, read in its sources and confirmed by its tip, which converges to the reference: strains
-angular first, rod along x, strain on the right of the pose, base pose as quaternion (x, y, z, w)
-and position, "horizontal" being the identity (its default is "upright"); a tendon's input is its
-tension >= 0 and its coordinate minus the length of its path.
+The conventions below follow SoRoMoX's sources and are confirmed by the convergence of its tip to
+the reference. Strains are angular first, the rod is along x, the strain acts on the right of the
+pose. The base pose is a quaternion (x, y, z, w) and a position; "horizontal" is the identity (the
+default is "upright"). The input of a tendon is its tension >= 0, its coordinate minus the length of
+its path.
 """
 
 from collections.abc import Callable
@@ -41,9 +42,9 @@ BFGS = "energy, BFGS, cells side by side (used)"
 
 
 class Setting(NamedTuple):
-    """Order of the basis of all six strains, Gauss points along the arm, the step, in whitened
-    coordinates, that ends the iteration, the family of the basis, and how the balance is found: a
-    key of `FORMULATIONS`."""
+    """Order of the basis of all six strains, Gauss points along the arm, step size in whitened
+    coordinates that ends the iteration, family of the basis, and the formulation, a key of
+    `UNLOADED`."""
 
     order: int
     points: int
@@ -67,7 +68,7 @@ class HelixPath(BaseThreadlikeRoutingParams):
 
     @property
     def num_paths(self) -> int:
-        """How many paths this holds."""
+        """Number of paths."""
         return 1
 
     def validate_structure(self) -> None:
@@ -79,7 +80,7 @@ class HelixPath(BaseThreadlikeRoutingParams):
 
 class Arm(NamedTuple):
     """A robot of SoRoMoX, the force on its tip [N], None for an arm without loads, and the matrix
-    from whitened coordinates to the robot's own."""
+    from whitened coordinates to those of the robot."""
 
     robot: Any
     force: Array | None
@@ -87,7 +88,7 @@ class Arm(NamedTuple):
 
 
 def offset(path: HelixPath, s: Array) -> Array:
-    """Where the path crosses the section at s, in the section's frame [m]."""
+    """Position [m] of the path in the section at s, in the body frame."""
     phi = path.phase + s / (path.radius * jnp.tan(path.angle))
     return jnp.stack([jnp.zeros_like(phi), path.radius * jnp.cos(phi), path.radius * jnp.sin(phi)])
 
@@ -98,7 +99,7 @@ def offset_slope(path: HelixPath, s: Array) -> Array:
 
 
 def tendon(path: HelixPath) -> ThreadlikeActuator:
-    """The path driven as a tendon."""
+    """A tendon along the path."""
     return ThreadlikeActuator.tendons(
         ThreadlikeRouting(params=path, offset_fn=offset, derivative_fn=offset_slope)
     )
@@ -136,7 +137,7 @@ def own_kinematics(robot: Any, q: Array) -> Array:
 
 
 def cells(robot: Any, q: Array) -> Array:
-    """The same poses with the cells side by side: SoRoMoX's bases, two-point Magnus step and
+    """The same poses with the cells in a batch: SoRoMoX's bases, two-point Magnus step and
     exponential."""
     q = robot._min_size_gathered(q)[0, 1]
     width = robot.segment_lengths[0] * robot.cell_widths[0][:, None]
@@ -167,19 +168,19 @@ def energy(
 
 
 def slope(arm: Arm, path: HelixPath, tau: Array, z: Array, share: Any = 1.0) -> Array:
-    """Gradient of the energy by z: what vanishes at equilibrium."""
+    """Gradient of the energy with respect to z, zero at equilibrium."""
     return jax.grad(energy, argnums=3)(arm, path, tau, z, share)
 
 
 def minimise(value_and_grad: Callable, z: Array, tolerance: float, max_steps: int = 60) -> Array:
-    """BFGS from z with steps of length one, halved while the energy does not fall, until a step is
+    """BFGS from z with unit steps, halved while the energy does not decrease, until a step is
     shorter than the tolerance."""
 
     def step(state: tuple) -> tuple:
         z, value, slope, inverse, length, _, count = state
         move = -length * (
             inverse @ slope
-        )  # none in the first pass, which fetches value and slope at the start
+        )  # zero in the first iteration, which evaluates value and slope at the start
         new_value, new_slope = value_and_grad(z + move)
         change = new_slope - slope
         curvature, image = move @ change, inverse @ change
@@ -224,8 +225,8 @@ def equilibrium(
 def height_gradient(
     arm: Arm, path: HelixPath, tau: Array, tolerance: float, solve: Callable = equilibrium
 ) -> HelixPath:
-    """Derivative of the tip's height by the path's numbers: implicit, the adjoint by conjugate
-    gradients on Hessian products."""
+    """Derivative of the tip's height with respect to the numbers of the path, by implicit
+    differentiation; the adjoint comes from conjugate gradients with Hessian products."""
     z = solve(arm, path, tau, tolerance)
     right = jax.grad(lambda z: tip(arm, z)[2])(z)
     _, hessian = jax.linearize(partial(slope, arm, path, tau), z)
@@ -234,7 +235,7 @@ def height_gradient(
 
 
 def _forces(arm: Arm, path: HelixPath, tau: Array, z: Array, share: Any) -> Array:
-    """The residual as SoRoMoX's authors write it, with the tip force by the Jacobian: K q - A(q) u
+    """Residual of SoRoMoX's authors, with the tip force through the Jacobian: K q - A(q) u
     + share (G(q) - J^T f)."""
     robot, q = arm.robot, arm.whiten @ z
     loads = robot.gravitational_force(q) - robot.jacobian_tips(q)[-1, 3:].T @ arm.force
@@ -242,8 +243,8 @@ def _forces(arm: Arm, path: HelixPath, tau: Array, z: Array, share: Any) -> Arra
 
 
 def _newton(residual: Callable, arm: Arm, path: HelixPath, tau: Array, tolerance: float) -> Array:
-    """Newton's method by `jax.jacfwd`: one step at each of eight shares of the loads, then four at
-    the whole."""
+    """Newton's method with `jax.jacfwd`: one step at each of eight shares of the loads, then four
+    more at full load."""
 
     def step(z: Array, share: Array) -> tuple[Array, None]:
         at = partial(residual, arm, path, tau, share=share)
@@ -264,8 +265,8 @@ def _optimistix(arm: Arm, path: HelixPath, tau: Array, tolerance: float) -> Arra
 def _newton_from_rest(
     arm: Arm, path: HelixPath, tau: Array, tolerance: float, max_steps: int = 30
 ) -> Array:
-    """K q = A(q) u as SoRoMoX's authors write it, by Newton's method until a step is shorter than
-    the tolerance; no loads."""
+    """Solution of K q = A(q) u, the form of SoRoMoX's authors, by Newton's method until a step is
+    shorter than the tolerance; without loads."""
 
     def residual(z: Array) -> Array:
         q = arm.whiten @ z

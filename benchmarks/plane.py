@@ -1,16 +1,16 @@
-"""Margin and convergence of one arm over a plane of tension and pressure, and what SoRoMoX makes of
-the same inputs.
+"""Stability margin and convergence of one arm over a plane of tension and pressure, and the results
+of SoRoMoX for the same inputs.
 
-A stout silicone arm with a tendon that comes in towards the axis and a chamber opposite. Run it,
-after `pip install ".[bench]"`, with
+The arm is a stout silicone arm with a tendon that converges towards the axis and a chamber opposite
+to it. Run it, after `pip install ".[bench]"`, with
 
     python benchmarks/plane.py --plot benchmarks/results/plane.png
         --json benchmarks/results/plane.json
 
-SoRoMoX (0.5) has no static solver: its side is its authors' way, Newton's method from rest on its
+SoRoMoX (0.5) has no static solver. It is used as its authors do: Newton's method from rest on its
 own forces, K q = A(q) u, with Legendre polynomials of order 6 for all six strains. A shape counts
-as right within one per cent of the length of the tip of our solve with 96 steps, which is exact in
-the strain; both sides are float64.
+as right if its tip is within 1 % of the length of that of vsr_jax with 96 steps, which is exact in
+the strain. Both tools use float64.
 """
 
 import argparse
@@ -32,7 +32,7 @@ import vsr_jax as vsr
 LENGTH, RADIUS, YOUNG, POISSON = 0.12, 0.015, 6e5, 0.45
 AREA = 2e-4
 TENDON, CHAMBER = (0.008, -0.05), (-0.008, 0.0)
-"""Where tendon and chamber start [m] and by how much they come nearer to the axis [m/m]."""
+"""Position of tendon and chamber at the base [m], and their slope [m/m]."""
 MOST_TENSION, MOST_PRESSURE = 220.0, 12e5
 SAME = 0.01
 RIGHT, SILENT, UNSAID, DIVERGED = (
@@ -65,8 +65,8 @@ def ours(inputs: np.ndarray) -> tuple[np.ndarray, ...]:
 
 
 def soromox(inputs: np.ndarray, order: int = 6, points: int = 40) -> tuple[np.ndarray, ...]:
-    """Residual without unit and tip [m] where SoRoMoX's own forces are solved by Newton's method
-    from rest."""
+    """Dimensionless residual and tip [m] of SoRoMoX's own forces, solved by Newton's method from
+    rest."""
     from soromox.actuation import ThreadlikeActuator, ThreadlikeRouting  # pyright: ignore[reportMissingImports]
     from soromox.systems.components import JointSpec, LinkSpec  # pyright: ignore[reportMissingImports]
     from soromox.systems.gvs import GVS, GVSSegment, StrainBasisSpec  # pyright: ignore[reportMissingImports]
@@ -118,7 +118,7 @@ def soromox(inputs: np.ndarray, order: int = 6, points: int = 40) -> tuple[np.nd
 def verdicts(
     status: np.ndarray, tip: np.ndarray, left: np.ndarray, other: np.ndarray
 ) -> np.ndarray:
-    """What SoRoMoX's answers are, given ours."""
+    """Verdicts on the results of SoRoMoX, given those of vsr_jax."""
     converged = left < 1e-6
     same = np.linalg.norm(tip - other, axis=-1) < SAME * LENGTH
     known = status == vsr.Status.CONVERGED
@@ -164,7 +164,7 @@ def draw(
     image = axes[0].pcolormesh(
         tensions, pressures, shown, cmap="Blues_r", vmin=0, vmax=1, shading="nearest"
     )
-    figure.colorbar(image, ax=axes[0], label="margin of stability")
+    figure.colorbar(image, ax=axes[0], label="stability margin")
     axes[0].contour(tensions, pressures, shown, levels=[0.1, 0.3], colors="white", linewidths=0.8)
     names = [
         Patch(color=colour, label=key.name.lower().replace("_", " "))
@@ -187,11 +187,11 @@ def draw(
 
 
 def main() -> None:
-    """Both sides on the same inputs; counts, JSON and the figure."""
+    """Runs both tools on the same inputs; prints counts, writes JSON and the figure."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--size", type=int, default=41, help="points a side (default: %(default)s)")
+    parser.add_argument("--size", type=int, default=41, help="points per side (%(default)s)")
     parser.add_argument("--plot", metavar="FILE")
     parser.add_argument("--json", metavar="FILE")
     options = parser.parse_args()

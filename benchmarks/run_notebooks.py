@@ -1,9 +1,9 @@
-"""Runs the notebooks, each in a fresh kernel, and says how long each takes.
+"""Runs the notebooks, each in a fresh kernel, and prints the time of each.
 
     pip install ".[notebooks]" && python benchmarks/run_notebooks.py [01_first_arm ...]
 
-They run in notebooks/ and are left as they are: what they put out goes to a temporary folder. Ends
-with 1 at the first that fails, after its name and the last line of its error.
+They run in notebooks/ and are not changed: outputs go to a temporary folder. The first failure ends
+the run with exit status 1, after its name and the last line of its error.
 """
 
 import argparse
@@ -19,7 +19,7 @@ COLOURS = re.compile(r"\x1b\[[0-9;]*m")
 
 
 def chosen(names: list[str]) -> list[Path]:
-    """Notebooks by name, with or without the ending; all of them without names."""
+    """Notebooks by name, with or without the extension; all notebooks if no names are given."""
     known = {path.stem: path for path in sorted(FOLDER.glob("*.ipynb"))}
     unknown = [name for name in names if Path(name).stem not in known]
     if unknown:
@@ -28,7 +28,7 @@ def chosen(names: list[str]) -> list[Path]:
 
 
 def run(path: Path, timeout: int) -> str | None:
-    """The last line of the error, None where there is none."""
+    """Last line of the error, None if the notebook succeeds."""
     with tempfile.TemporaryDirectory() as out:
         settings = [
             f"--ExecutePreprocessor.timeout={timeout}",
@@ -59,10 +59,10 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "notebooks", nargs="*", metavar="NOTEBOOK", help="names of single notebooks, all by default"
+        "notebooks", nargs="*", metavar="NOTEBOOK", help="names of notebooks, all by default"
     )
     parser.add_argument(
-        "--timeout", type=int, default=600, metavar="SECONDS", help="for one cell (600)"
+        "--timeout", type=int, default=600, metavar="SECONDS", help="limit for one cell (600)"
     )
     options = parser.parse_args()
     for path in chosen(options.notebooks):

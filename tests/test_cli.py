@@ -106,7 +106,7 @@ def test_solve_prints_the_result_in_words(solved):
 def test_a_solve_that_fails_says_why(collapsed):
     assert collapsed.code == cli_common.NOT_CONVERGED
     assert re.search(r"status +collapsed: ", collapsed.out)
-    assert collapsed.err.endswith("arm.png is not drawn, there is no shape\n")
+    assert collapsed.err.endswith("arm.png is not drawn: the solve failed\n")
     assert not (collapsed.folder / "arm.png").exists()
     assert collapsed.arm["converged"] is False
     assert collapsed.arm["status"].startswith("collapsed")
@@ -145,7 +145,7 @@ def test_a_file_without_inputs_asks_for_them(tmp_path, capsys):
     path.write_text(re.sub("inputs = .*", "", pathlib.Path(HELIX).read_text()))
     assert cli.main(["solve", str(path)]) == cli_common.BAD_USAGE
     assert (
-        "arm.toml: holds no inputs, need --inputs, one number each for Thread"
+        "arm.toml: has no inputs, need --inputs, one number each for Thread"
         in capsys.readouterr().err
     )
 
@@ -277,7 +277,7 @@ def test_bounds_of_a_sweep_are_one_or_one_an_actuator(capsys):
 def test_a_tolerance_chooses_the_steps_and_tells_the_error(capsys):
     assert cli.main(["solve", HELIX, "--tolerance", "1e-4"]) == cli_common.DONE
     error = re.search(
-        r"  error      (\S+) m of the tip against a finer solve, with "
+        r"  error      (\S+) m of the tip from a finer solve, with "
         r"StrainDependent\(steps=(\d+), order=6\)",
         capsys.readouterr().out,
     )

@@ -148,5 +148,5 @@ def test_a_tolerance_beyond_the_precision_is_refused(monkeypatch):
 def test_solve_refuses_a_model_besides_a_tolerance_and_traced_inputs(unchecked):
     with pytest.raises(ValueError, match=r"tolerance: got 0\.001 and a model, need one of them"):
         vsr.solve(HELICES, [-1.0, -1.0], model=FINE, tolerance=1e-3)
-    with pytest.raises(ValueError, match=r"under jax\.jit use a vsr.plan made before"):
+    with pytest.raises(ValueError, match=r"under jax\.jit use the result of an earlier vsr\.plan"):
         jax.jit(lambda u: vsr.solve(HELICES, u, tolerance=1e-3).tip)(jnp.array([-1.0, -1.0]))

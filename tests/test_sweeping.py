@@ -415,13 +415,13 @@ def test_another_sweep_is_refused(tmp_path):
     [
         ({"inputs": inputs[0]}, r"sweep.inputs: got shape \(2,\), need \(samples, 2\)"),
         ({"inputs": inputs[:, :1]}, r"got shape \(23, 1\), need \(samples, 2\)"),
-        ({"inputs": inputs[:0]}, "need arrays with one first axis"),
+        ({"inputs": inputs[:0]}, "need arrays with the same number of samples"),
         (
             {"scene": lambda s: s, "inputs": {"a": inputs, "b": inputs[:3]}},
             r"a \(23,\), inputs_b \(3,\), need",
         ),
         ({"scene": "arm"}, "sweep.scene: got 'arm', need a Scene"),
-        ({"outputs": "height"}, "sweep.outputs: got 'height', need some of tip, stability"),
+        ({"outputs": "height"}, "sweep.outputs: got 'height', need names from tip, stability"),
         ({"outputs": lambda eq: eq.tip}, "need arrays by name"),
         ({"outputs": lambda eq: {"status": eq.status}}, "need other names than status"),
         ({"chunk": 0}, "sweep.chunk: got 0, need an integer >= 1"),

@@ -1,5 +1,5 @@
-"""Names, units and descriptions in the store of a sweep: dimensions, coordinates and attributes as
-xarray shows them."""
+"""Names, units and descriptions in the store of a sweep: dimensions, coordinates and attributes in
+the form that xarray reads."""
 
 from collections.abc import Mapping
 from contextlib import suppress
@@ -22,15 +22,15 @@ from .sweep_program import Task, number
 
 
 class Label(NamedTuple):
-    """Names of an array's dimensions, and its attributes."""
+    """Dimension names and attributes of an array."""
 
     dims: tuple[str, ...]
     attributes: dict[str, Any]
 
 
 class Labels(NamedTuple):
-    """What a store holds besides samples and outputs: a label for each array, the values of the
-    coordinates, attributes."""
+    """Metadata of a store: a label for each array, the values of the coordinates, and the
+    attributes of the group."""
 
     arrays: dict[str, Label]
     coordinates: dict[str, np.ndarray]
@@ -69,7 +69,7 @@ _AXES = {
     ),
     "part": _Coordinate("part", "part of the energy", np.array(Energy._fields)),
 }
-"""Coordinates of the axes that quantities of the table have, by name."""
+"""Coordinates of the axes of quantities, by name."""
 
 
 def labels(
@@ -77,8 +77,8 @@ def labels(
 ) -> Labels:
     """Labels of a sweep's store.
 
-    **Arguments:** the task; shapes and dtypes of its outputs; all samples, as a pytree and as
-    arrays by name.
+    **Arguments:** `task`; `like`: shapes and dtypes of its outputs; `samples`: all samples as a
+    pytree; `flat`: the same as arrays by name.
 
     **Raises:** `ValueError` for an output with the name of a dimension or coordinate, or with a
     slash in its name.
@@ -183,7 +183,7 @@ def _numbered(name: str, ndim: int) -> tuple[str, ...]:
 def _labelled(
     dims: tuple[str, ...], attributes: dict[str, Any], coordinates: Mapping[str, _Coordinate]
 ) -> Label:
-    """A label that names the coordinates that are no index, after the CF conventions."""
+    """A label that lists the non-index coordinates, as the CF conventions require."""
     more = [
         name
         for name, coordinate in coordinates.items()
@@ -196,8 +196,8 @@ def _check_names(outputs: Mapping[str, Any], taken: set[str]) -> None:
     for name in outputs:
         if name in taken or "/" in name:
             raise ValueError(
-                f"sweep.outputs: got {name!r}, need for a store a name without / and none of "
-                f"{', '.join(sorted(taken))}"
+                f"sweep.outputs: got {name!r}, need a name without / and other than "
+                f"{', '.join(sorted(taken))}, for a store"
             )
 
 

@@ -1,5 +1,5 @@
-"""One compiled program for many samples: side by side on each device, devices independent of each
-other."""
+"""One compiled program for many samples: batched on each device, without communication between
+devices."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -16,17 +16,17 @@ from ..models.base import Model
 from ..solution.solver import solve
 
 BATCH_SIZE = 512
-"""Samples that lie side by side on a CPU: more do not fit its caches, fewer leave its kernels too
-little to do."""
+"""Samples per batch on a CPU: larger batches do not fit its caches, smaller ones leave its kernels
+too little work."""
 
 
 def number(samples: Any) -> int:
-    """How many samples a pytree of arrays holds."""
+    """Number of samples in a pytree of arrays."""
     return len(jax.tree.leaves(samples)[0])
 
 
 class Task(eqx.Module):
-    """What is done with one sample."""
+    """Computation for one sample: scene, model and outputs."""
 
     scene: Scene | Callable
     model: Model | None
@@ -54,21 +54,21 @@ class Task(eqx.Module):
         if taken:
             raise ValueError(
                 f"sweep.outputs: got {taken[0]!r}, need other names than status and inputs..., "
-                f"which a sweep has already"
+                f"which are reserved"
             )
         return {**{name: jnp.asarray(value) for name, value in wanted.items()}, "status": eq.status}
 
 
 class Program:
-    """A task compiled for chunks of one size: those are cut into parts for the devices, these into
-    rows that lie side by side.
+    """A task compiled for one chunk size: a chunk is split over the devices, and each part into
+    batches.
 
-    As many samples lie side by side as is fast on a CPU, or fills another device, fewer where the
-    bound on memory says so. On a CPU the number does not depend on samples, chunk or devices, since
+    The batch size is `BATCH_SIZE` on a CPU and the whole part on other devices; it is reduced to
+    meet the bound on memory. On a CPU it does not depend on samples, chunk or devices, because
     rounding may depend on it.
 
-    **Arguments:** the task; all samples, NumPy arrays; samples in a chunk; the devices; bound on
-    memory [bytes].
+    **Arguments:** `task`; `samples`: all samples, NumPy arrays; `chunk`: samples per chunk; `mesh`:
+    the devices; `memory`: bound on memory [bytes].
     """
 
     def __init__(self, task: Task, samples: Any, chunk: int, mesh: Mesh, memory: int):
@@ -85,19 +85,19 @@ class Program:
                 return
             if batch_size == 1:
                 raise ValueError(
-                    f"sweep.memory: got {memory} bytes, need at least {needed} for a sample on "
-                    f"each device"
+                    f"sweep.memory: got {memory} bytes, need at least {needed} for one sample per "
+                    f"device"
                 )
             admitted = max(1, batch_size * memory // needed)
             batch_size = min(batch_size // 2, 1 << (admitted.bit_length() - 1))
 
     def __call__(self, index: int) -> dict[str, Any]:
-        """Outputs of a chunk, not waited for; rows that fill up the last one are copies of its last
+        """Outputs of a chunk, computed asynchronously; the chunk is padded with copies of its last
         sample."""
         return self._compiled(self._task, self._placed(index), self._batch_size, self._mesh)
 
     def samples_in(self, index: int) -> int:
-        """How many samples a chunk holds."""
+        """Number of samples in a chunk."""
         return min(self.chunk, number(self._samples) - index * self.chunk)
 
     def _placed(self, index: int) -> Any:
@@ -110,8 +110,8 @@ class Program:
 
 @eqx.filter_jit
 def _solved(task: Task, samples: Any, batch_size: int, mesh: Mesh) -> dict[str, Any]:
-    """Outputs of all samples, each device by itself, `batch_size` side by side: no loop waits for
-    another device's samples."""
+    """Outputs of all samples in batches of `batch_size`; no loop waits for the samples of another
+    device."""
     arrays, static = eqx.partition(task, eqx.is_array)
 
     def part(arrays: Any, samples: Any) -> dict[str, Any]:
@@ -121,7 +121,7 @@ def _solved(task: Task, samples: Any, batch_size: int, mesh: Mesh) -> dict[str, 
         task = eqx.combine(arrays, static)
         outputs = lax.map(
             jax.vmap(lambda sample: task(sample)), rows
-        )  # JAX writes out the name of what it maps, a scene at length
+        )  # a lambda: JAX prints the name of the mapped function, for a task its whole scene
         return jax.tree.map(lambda x: x.reshape(len(x) * batch_size, *x.shape[2:]), outputs)
 
     split = PartitionSpec("samples")

@@ -1,5 +1,4 @@
-"""Where the chunks of a sweep are kept: in memory, or in a Zarr folder that outlives the
-process."""
+"""Storage of a sweep's chunks: in memory, or in a Zarr folder on disk."""
 
 import hashlib
 import json
@@ -33,11 +32,11 @@ _SAID = 8
 
 
 class InMemory:
-    """Chunks in memory, those of all processes put together at the end.
+    """Chunks in memory; the chunks of all processes are gathered at the end.
 
     **Arguments:**
-    - `like`: shapes and dtypes of everything that will come.
-    - `chunk`: samples in a chunk; chunk i is that of process i modulo their number.
+    - `like`: shapes and dtypes of all outputs.
+    - `chunk`: samples per chunk; chunk i belongs to process i modulo the number of processes.
     """
 
     def __init__(self, like: Arrays, chunk: int):
@@ -49,7 +48,7 @@ class InMemory:
         }
 
     def missing(self, indices: Iterable[int]) -> list[int]:
-        """Chunks that have to be computed: all."""
+        """Chunks to compute: all."""
         return list(indices)
 
     def writing(self) -> AbstractContextManager[None]:
@@ -57,12 +56,12 @@ class InMemory:
         return nullcontext()
 
     def write(self, index: int, arrays: Arrays) -> None:
-        """Keeps a chunk."""
+        """Stores a chunk."""
         for name, rows in self._rows.items():
             rows[index // jax.process_count(), : len(arrays[name])] = arrays[name]
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Everything, in the order of the samples."""
+        """All outputs, in the order of the samples."""
         return {
             name: self._joined(rows)[: len(self._like[name])] for name, rows in self._rows.items()
         }
@@ -78,19 +77,19 @@ class Archive:
     """Chunks in a Zarr folder: one file per chunk and array, each with a checksum (CRC-32C); the
     status of a chunk is written last.
 
-    A chunk has to be computed if it has no status yet, or if one of its files is missing or does
-    not match its checksum. All metadata have a checksum in the attributes of the group. While a
-    sweep writes, it holds a lock that ends with its process.
+    A chunk is computed if it has no status yet, or if one of its files is missing or does not match
+    its checksum. The attributes of the group hold a checksum of all metadata. A sweep that writes
+    holds a lock, which is released at the latest when its process ends.
 
     **Arguments:**
-    - `path`: the folder; made if it is not there, else it has to hold the same sweep.
-    - `like`, `chunk`: as for `InMemory`; the chunks of a folder keep their size.
-    - `samples`: what is solved, which is kept too.
+    - `path`: the folder; created if it does not exist, else it must hold the same sweep.
+    - `like`, `chunk`: as for `InMemory`; an existing folder keeps its chunk size.
+    - `samples`: the samples, which are stored too.
     - `labels`: names of dimensions, coordinates and attributes.
     - `digest`: a hash that identifies the sweep.
 
-    **Raises:** `ImportError` without Zarr; `ValueError` for a folder that holds something else, or
-    whose metadata are damaged.
+    **Raises:** `ImportError` without Zarr; `ValueError` for a folder with other content or with
+    damaged metadata.
     """
 
     def __init__(
@@ -117,13 +116,13 @@ class Archive:
         self._finished = bool(_attributes(self._path, digest)["finished"])
         with zarr.config.set(
             {"array.write_empty_chunks": True}
-        ):  # a file that is not there is damage
+        ):  # so that a missing file means damage
             group = zarr.open_group(self._path, mode="r+")
             self._arrays = {name: group[name] for name in (*self._given, *like)}
         self.chunk = self._arrays["status"].chunks[0]
 
     def missing(self, indices: Iterable[int]) -> list[int]:
-        """Chunks that have to be computed. Reads every file of the chunks once."""
+        """Chunks to compute. Reads every file of the chunks once."""
         todo = []
         for index in indices:
             begun = self._finished or self._file("status", index).exists()
@@ -143,7 +142,7 @@ class Archive:
         """Context in which chunks are written, after `missing`: holds the lock if any process has
         something to write.
 
-        Warns of what is damaged. Ends when all processes are done.
+        Warns about damaged chunks. Ends when all processes are done.
 
         **Raises:** `ValueError` if another sweep is writing to the folder.
         """
@@ -166,13 +165,13 @@ class Archive:
                 os.close(lock)
 
     def write(self, index: int, arrays: Arrays) -> None:
-        """Writes a chunk, each file whole or not at all."""
+        """Writes a chunk, each file atomically."""
         start = index * self.chunk
         for name in sorted(arrays, key="status".__eq__):
             self._arrays[name][start : start + len(arrays[name])] = arrays[name]
 
     def arrays(self) -> dict[str, Any]:
-        """Zarr's arrays of the outputs."""
+        """The Zarr arrays of the outputs."""
         return {name: self._arrays[name] for name in self._outputs}
 
     def _span(self, name: str, index: int) -> slice:
@@ -184,31 +183,31 @@ class Archive:
 
     def _sound(self, name: str, index: int) -> bool:
         """Whether the file of a chunk exists and matches its checksum; true for a chunk beyond the
-        end, which has none."""
+        end, which has no file."""
         span = self._span(name, index)
         if span.start >= span.stop or self._arrays[name].size == 0:
             return True
         try:
             self._arrays[name][span]
-        except (ValueError, TypeError, RuntimeError):  # of the checksum, and of codecs
+        except (ValueError, TypeError, RuntimeError):  # from checksums and codecs
             return False
         return self._file(name, index).exists()
 
     def _repair(self) -> None:
-        """Removes damaged files; samples and coordinates are written again."""
+        """Removes damaged files, and rewrites samples and coordinates."""
         if not self._damaged:
             return
-        warnings.warn(self._said(), stacklevel=5)  # where sweep is called
+        warnings.warn(self._said(), stacklevel=5)  # the caller of sweep
         for name, index in sorted(
             self._damaged, key=lambda place: place[0] != "status"
-        ):  # a chunk without status is not there
+        ):  # status first: a chunk without it counts as missing
             self._file(name, index).unlink(missing_ok=True)
             if name in self._given:
                 span = self._span(name, index)
                 self._arrays[name][span] = self._given[name][span]
 
     def _said(self) -> str:
-        """What is damaged, in one line."""
+        """The warning about damaged chunks."""
         spans = [(name, self._span(name, index)) for name, index in self._damaged]
         said = ", ".join(f"{name}[{span.start}:{span.stop}]" for name, span in spans[:_SAID])
         more = f" and {len(spans) - _SAID} more" if len(spans) > _SAID else ""
@@ -218,7 +217,7 @@ class Archive:
         )
 
     def _create(self, zarr: Any, like: Arrays, chunk: int, labels: Labels, digest: str) -> None:
-        """Makes the folder beside its place and moves it there whole."""
+        """Creates the folder under a temporary name, then renames it atomically."""
         if not self._path.absolute().parent.is_dir():
             raise ValueError(f"sweep.out: there is no folder {str(self._path.absolute().parent)!r}")
         draft = _beside(self._path)
@@ -232,20 +231,20 @@ class Archive:
                     array[...] = x
             with (
                 warnings.catch_warnings()
-            ):  # xarray asks for consolidated metadata, Zarr warns of them
+            ):  # xarray needs consolidated metadata, Zarr warns about them
                 warnings.simplefilter("ignore")
                 zarr.consolidate_metadata(draft)
             _seal(draft, digest=digest, finished=0)
             draft.rename(self._path)
         except OSError:
-            if not self._path.exists():  # else another process has been faster
+            if not self._path.exists():  # else another process created it first
                 raise
         finally:
             shutil.rmtree(draft, ignore_errors=True)
 
 
 def _array(zarr: Any, group: Any, name: str, x: Any, rows: int, label: Label) -> Any:
-    """An empty array whose chunks have a number of rows and a checksum."""
+    """An empty array with `rows` rows per chunk and a checksum for each chunk."""
     text = x.dtype.kind == "U"
     return group.create_array(
         name,
@@ -267,10 +266,10 @@ def _array(zarr: Any, group: Any, name: str, x: Any, rows: int, label: Label) ->
 
 
 def _attributes(path: Path, digest: str) -> dict[str, Any]:
-    """Attributes of a sweep's folder, which has to hold the sweep with that digest."""
+    """Attributes of a sweep's folder; raises if it does not hold the sweep with that digest."""
     if not (path / _METADATA).is_file():
         raise ValueError(
-            f"sweep.out: {path} is there and holds no sweep (no {_METADATA}), need a new path"
+            f"sweep.out: {path} exists and holds no sweep (no {_METADATA}), need a new path"
         )
     try:
         root = json.loads((path / _METADATA).read_bytes())
@@ -282,10 +281,10 @@ def _attributes(path: Path, digest: str) -> dict[str, Any]:
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         ours, sound, attributes = True, False, {}
     if not ours:
-        raise ValueError(f"sweep.out: {path} is there and holds no sweep, need a new path")
+        raise ValueError(f"sweep.out: {path} exists and holds no sweep, need a new path")
     if not sound:
         raise ValueError(
-            f"sweep.out: the metadata in {path} are damaged, changed or of another version of "
+            f"sweep.out: the metadata in {path} are damaged, changed or from another version of "
             f"vsr_jax; need a new path"
         )
     if attributes["digest"] != digest:
@@ -297,7 +296,7 @@ def _attributes(path: Path, digest: str) -> dict[str, Any]:
 
 
 def _seal(path: Path, **attributes: Any) -> None:
-    """Adds attributes, and the checksum of all metadata, to the group in a folder; in one step."""
+    """Adds attributes, and the checksum of all metadata, to the group in a folder, atomically."""
     root = json.loads((path / _METADATA).read_bytes())
     root["attributes"] |= attributes
     root["attributes"]["checksum"] = _checksum(path, root)
@@ -307,7 +306,7 @@ def _seal(path: Path, **attributes: Any) -> None:
 
 
 def _checksum(path: Path, root: dict[str, Any]) -> str:
-    """Hash of all metadata: those of the group without their own checksum, those of its arrays."""
+    """Hash of the metadata of the group, without the checksum itself, and of its arrays."""
     attributes = {name: value for name, value in root["attributes"].items() if name != "checksum"}
     digest = hashlib.sha256(json.dumps(root | {"attributes": attributes}, sort_keys=True).encode())
     for name in sorted(root["consolidated_metadata"]["metadata"]):
@@ -316,12 +315,11 @@ def _checksum(path: Path, root: dict[str, Any]) -> str:
 
 
 def _locked(path: Path) -> int | None:
-    """A file descriptor that holds the lock of a folder until it is closed, at the latest by the
-    end of the process.
+    """A file descriptor that holds the lock of a folder until it is closed or the process ends.
 
-    None where the file system has no locks.
+    None where the file system does not support locks.
     """
-    file = path / "status" / _METADATA  # which is never replaced
+    file = path / "status" / _METADATA  # a file that is never replaced
     lock = os.open(file, os.O_RDWR if os.access(file, os.W_OK) else os.O_RDONLY)
     try:
         if fcntl is not None:
@@ -329,7 +327,7 @@ def _locked(path: Path) -> int | None:
     except BlockingIOError:
         os.close(lock)
         raise ValueError(
-            f"sweep.out: another sweep is writing to {path}, need its end or a new path"
+            f"sweep.out: another sweep is writing to {path}; wait until it ends or give a new path"
         ) from None
     except OSError:
         os.close(lock)
@@ -338,7 +336,7 @@ def _locked(path: Path) -> int | None:
 
 
 def _beside(path: Path) -> Path:
-    """A new name in the folder of `path`, hidden."""
+    """A new hidden name in the parent folder of `path`."""
     return path.with_name(f".{path.name}.{uuid.uuid4().hex}")
 
 
@@ -354,7 +352,7 @@ def _zarr() -> Any:
 
 
 def _any(here: bool) -> bool:
-    """Whether something is true in any process."""
+    """Whether the argument is true in any process."""
     return (
         bool(np.any(multihost_utils.process_allgather(np.array(here))))
         if jax.process_count() > 1

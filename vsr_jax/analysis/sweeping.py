@@ -1,5 +1,5 @@
-"""Many equilibria at once: any number of samples, in chunks, over all devices and processes, to
-memory or to disk."""
+"""`sweep`: equilibria of any number of samples, in chunks, on all devices and processes, stored in
+memory or on disk."""
 
 import os
 import re
@@ -23,8 +23,8 @@ from .sweep_store import Archive, InMemory
 
 
 def known_outputs() -> tuple[str, ...]:
-    """Names of the quantities that a sweep can store: those of the table that are one array and no
-    function of X, and the solver's `steps`."""
+    """Names of the quantities that a sweep can store: those of the table that are a single array
+    and not a function of X, and the solver's `steps`."""
     table = (entry for entry in QUANTITIES.values() if isinstance(entry, Quantity))
     return (*(entry.name for entry in table if entry.dims is not None), "steps")
 
@@ -36,12 +36,12 @@ Outputs: TypeAlias = str | Sequence[str] | Callable[[Equilibrium], Mapping[str, 
 
 
 class Sweep(Mapping[str, Any]):
-    """Outcome of a sweep: a mapping from the names of its outputs to arrays whose first axis is
-    that of the samples.
+    """Result of a sweep: a mapping from the names of its outputs to arrays whose first axis is that
+    of the samples.
 
-    **Fields:** `status`, a `Status` as an integer for each sample; the outputs are NaN where it is
-    not converged. The arrays are NumPy's, or, of a sweep to disk, Zarr's, which read what is asked
-    for, as in `result["tip"][:100]`.
+    **Fields:** `status`, a `Status` as an integer for each sample; outputs of samples that did not
+    converge are NaN. The arrays are NumPy arrays; for a sweep to disk they are Zarr arrays, which
+    read only the requested part, as in `result["tip"][:100]`.
     """
 
     def __init__(self, arrays: Mapping[str, Any]):
@@ -64,7 +64,7 @@ class Sweep(Mapping[str, Any]):
 
     @property
     def counts(self) -> dict[str, int]:
-        """How many samples ended with each status, by its name."""
+        """Number of samples for each status, by its name."""
         values, numbers = np.unique(np.asarray(self.status), return_counts=True)
         return {
             Status(int(value)).name.lower(): int(number)
@@ -93,12 +93,13 @@ def sweep(
     """Equilibria of many inputs, or of many scenes.
 
         # tensions: (samples, actuators)
-        tips = vsr.sweep(scene, tensions)["tip"] vsr.sweep(lambda s: (arm(s["radius"]),
-        s["tensions"]), {"radius": radii, "tensions": tensions}, out="designs.zarr")
+        tips = vsr.sweep(scene, tensions)["tip"]
+        samples = {"radius": radii, "tensions": tensions}
+        vsr.sweep(lambda s: (arm(s["radius"]), s["tensions"]), samples, out="designs.zarr")
 
-    One compiled program solves chunk after chunk, a part on each device. Where several processes
-    share a `jax.distributed` runtime, each calls this and takes its share of the chunks. No sample
-    changes another; one that fails says so in its status.
+    One compiled program solves chunk after chunk, a part on each device. If several processes share
+    a `jax.distributed` runtime, each of them calls `sweep` and solves its share of the chunks.
+    Samples are independent; the status of each shows whether it converged.
 
     **Arguments:**
     - `scene`: a scene, or a function from one sample to a scene and the inputs of its actuators.
@@ -106,36 +107,35 @@ def sweep(
       first axis is the samples.
     - `outputs`: names of quantities of an `Equilibrium` that are one array (`tip`, `lengths`,
       `forces`, `slack`, `stability`, `condition`, `energy`, `q`, or one added to the table) and
-      `steps`, or a function from an `Equilibrium` to arrays by name; nothing else is computed.
+      `steps`, or a function from an `Equilibrium` to a dict of arrays; nothing else is computed.
     - `model`: as for `solve`.
-    - `out`: a folder for Zarr (`pip install "vsr-jax[sweep]"`), which `xarray.open_zarr` reads: see
-      below. Each chunk is written when it is done. The same call resumes a sweep that was killed,
-      and reads one that has finished; results are bit-identical on the same devices.
-    - `chunk`: samples in a chunk, 16,384 by default, of which other devices than CPUs get one each;
-      a folder keeps its own.
-    - `memory`: bound [bytes] on the intermediate values of the compiled program, by which fewer
-      samples are solved side by side.
-    - `devices`: those of this process that take part, all by default.
+    - `out`: a Zarr folder (`pip install "vsr-jax[sweep]"`), which `xarray.open_zarr` reads, see
+      below. Each chunk is written when it is done. The same call resumes an interrupted sweep and
+      reads a finished one; results are bit-identical on the same devices.
+    - `chunk`: samples per chunk, by default 16,384 on CPUs and 16,384 per device otherwise; an
+      existing folder keeps its own.
+    - `memory`: bound [bytes] on the intermediate values of the compiled program; it limits the
+      batch size.
+    - `devices`: devices of this process to use, all by default.
     - `progress`: whether to show a bar with rate and remaining time.
 
     **The store:** `tip` has the dimensions (sample, row, column), `inputs`, `lengths`, `forces` and
     `slack` (sample, actuator), `q` (sample, dof), or (sample, actuator) where it is the thread
-    forces; outputs of a function have (sample, NAME_dim_1, ...), and so have the samples given to a
-    function of the scene. Units are attributes, or coordinates where they differ: `input_units`,
-    `column_units`, `dof_units`. `data.tip.sel(column="position", row=["x", "y", "z"])` is the tip's
-    place. The attributes hold the model, the precision, the version and, as TOML, a scene that has
-    no Python functions.
+    forces; outputs of a function have (sample, NAME_dim_1, ...), and so do the samples that a
+    function turns into scenes. Units are attributes, or coordinates where they differ along an
+    axis: `input_units`, `column_units`, `dof_units`. The tip position is
+    `data.tip.sel(column="position", row=["x", "y", "z"])`. The attributes hold the model, the
+    precision, the version and, as TOML, a scene that has no Python functions.
 
     Every chunk has a checksum (CRC-32C). Each call reads all chunks once to verify them, which
-    takes little time compared to solving them; what is missing or damaged is computed again, with
-    one warning. One sweep at a time writes to a folder.
+    takes little time compared to solving them; missing or damaged chunks are computed again, with
+    one warning. Only one sweep at a time can write to a folder.
 
-    **Returns:** a `Sweep`, whole in every process.
+    **Returns:** a `Sweep` with all samples, in every process.
 
-    **Raises:** `ValueError` for samples of a wrong shape or of different numbers, an unknown
-    output, a bound on memory that not even one sample keeps, an `out` that holds something else or
-    whose metadata are damaged, or one to which another sweep is writing; `ImportError` where Zarr
-    is missing.
+    **Raises:** `ValueError` for samples of a wrong shape or of unequal numbers, an unknown output,
+    a bound on memory that a single sample exceeds, an `out` with other content or with damaged
+    metadata, or one to which another sweep is writing; `ImportError` without Zarr.
 
     **Warns:** `UserWarning` where chunks in `out` are missing or damaged, with their names and
     samples.
@@ -158,7 +158,7 @@ def sweep(
 
 
 def _run(program: Program, chunks: list[int], archive: InMemory | Archive, progress: bool) -> None:
-    """Solves chunks, each while the one before is written."""
+    """Solves chunks; each is written while the next one is solved."""
     failed, before = 0, None
     with tqdm(
         total=sum(map(program.samples_in, chunks)),
@@ -191,14 +191,14 @@ def _named(outputs: Outputs) -> tuple[str, ...] | Callable:
     unknown = [name for name in names if name not in known]
     if unknown:
         raise ValueError(
-            f"sweep.outputs: got {', '.join(map(repr, unknown))}, need some of "
+            f"sweep.outputs: got {', '.join(map(repr, unknown))}, need names from "
             f"{', '.join(known)}, or a function"
         )
     return names
 
 
 def _samples(scene: Scene | Callable, inputs: Any) -> Any:
-    """The samples as NumPy arrays in the dtype JAX gives them."""
+    """The samples as NumPy arrays, in the dtypes that JAX converts them to."""
     samples = jax.tree.map(
         lambda x: np.asarray(x, jax.dtypes.canonicalize_dtype(np.asarray(x).dtype)), inputs
     )
@@ -207,7 +207,7 @@ def _samples(scene: Scene | Callable, inputs: Any) -> Any:
         if samples.ndim != 2 or samples.shape[1] != len(scene.actuators):
             raise ValueError(
                 f"sweep.inputs: got shape {samples.shape}, need (samples, "
-                f"{len(scene.actuators)}), a row for each sample"
+                f"{len(scene.actuators)}), one row per sample"
             )
         if not np.issubdtype(samples.dtype, np.floating):
             samples = samples.astype(jax.dtypes.canonicalize_dtype(float))
@@ -220,14 +220,15 @@ def _samples(scene: Scene | Callable, inputs: Any) -> Any:
     if len(set(numbers.values())) != 1 or min(numbers.values()) in ((), (0,)):
         said = ", ".join(f"{name} {shape}" for name, shape in numbers.items())
         raise ValueError(
-            f"sweep.inputs: got {said or 'no array'}, need arrays with one first axis, that of "
-            f"the samples, at least one"
+            f"sweep.inputs: got {said or 'no array'}, need arrays with the same number of samples "
+            f"along their first axis, at least one"
         )
     return samples
 
 
 def _flat(samples: Any) -> dict[str, np.ndarray]:
-    """The samples by name: `inputs`, or with the places in their tree, as in `inputs_radius`."""
+    """The samples by name: `inputs`, followed by their path in the pytree, as in
+    `inputs_radius`."""
     leaves = jax.tree_util.tree_flatten_with_path(samples)[0]
     return {
         "_".join(["inputs", *re.findall(r"\w+", jax.tree_util.keystr(path))]): x

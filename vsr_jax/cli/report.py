@@ -1,5 +1,5 @@
-"""A solved scene, and the health of a solve, for people and for programs: lines of text, and
-records that go into JSON."""
+"""Reports of a solved scene and of the health of a solve, as lines of text and as records for
+JSON."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,11 +14,11 @@ from ..solution.summary import Summary
 
 
 def lines(eq: Equilibrium, title: str = "", *, error: bool = False) -> list[str]:
-    """An equilibrium in a few lines: status, tip, margin of stability, and of each thread its
-    input, force and length.
+    """A report of an equilibrium: status, tip, stability margin, and the input, force and length of
+    each thread.
 
-    **Arguments:** `eq`: one equilibrium, solved or not; `title`: a first line; `error`: whether to
-    solve finer too and tell the difference.
+    **Arguments:** `eq`: one equilibrium, converged or not; `title`: a first line; `error`: whether
+    to report the distance of the tip from that of a finer solve.
     """
     method = f"{type(eq.model).__name__}, {eq.inputs.dtype}, {int(eq.steps)} steps"
     text = [title] if title else []
@@ -31,26 +31,27 @@ def lines(eq: Equilibrium, title: str = "", *, error: bool = False) -> list[str]
     if error:
         finer = solve(eq.scene, eq.inputs, model=eq.model.finer())
         far = float(np.linalg.norm(np.asarray(finer.tip)[:3, 3] - tip[:3, 3]))
-        text.append(f"  error      {far:.2g} m of the tip against a finer solve, with {eq.model}")
+        text.append(f"  error      {far:.2g} m of the tip from a finer solve, with {eq.model}")
     text += [
         f"  its {name} axis {_vector(axis)}"
         for name, axis in zip("xyz", tip[:3, :3].T, strict=True)
     ]
     text.append(
         f"  stability  {float(eq.stability):.4g} (1 without forces, 0 where the equilibrium "
-        f"ceases to be stable)"
+        f"loses stability)"
     )
     return text + _threads(eq)
 
 
 def record(eq: Equilibrium, samples: Summary | None) -> dict[str, Any]:
-    """An equilibrium as numbers, texts and lists, with None for what a failed solve does not know.
+    """An equilibrium as numbers, strings and lists, with None for quantities that a failed solve
+    does not have.
 
-    **Arguments:** `eq`: one equilibrium; `samples`: the same at the stations to tell of, None for a
-    failed solve.
+    **Arguments:** `eq`: one equilibrium; `samples`: its summary at the stations to report, None for
+    a failed solve.
 
-    **Returns:** `model`, `precision`, `inputs`, `status` in words, `converged`, `steps`; `tip`
-    (pose, 4 x 4); at the stations `X` [m] the `position` [m] and the `strain` (k [1/m], u [-]); of
+    **Returns:** `model`, `precision`, `inputs`, `status` as a message, `converged`, `steps`; `tip`
+    (pose, 4 x 4); at the stations `X` [m] the `position` [m] and the `strain` (k [1/m], u [-]); for
     each thread the `force` [N] at its start, negative where it pulls, the `length` [m] and the
     `slack` [m]; `stability`.
     """
@@ -83,18 +84,18 @@ def record(eq: Equilibrium, samples: Summary | None) -> dict[str, Any]:
 
 
 def health_lines(health: Health, title: str = "") -> list[str]:
-    """The health of a solve in a few lines, the last of them warnings and advice."""
+    """A report of the health of a solve, with warnings and advice at the end."""
     eq, length = health.equilibrium, float(health.equilibrium.scene.rod.length)
     text = lines(eq, title)[: 3 if title else 2]
     if bool(eq.converged):
         digits = -np.log10(float(np.finfo(eq.inputs.dtype).eps) * float(eq.condition))
         text.append(
             f"  margin       {float(eq.stability):.4g} (1 without forces, 0 where the equilibrium "
-            f"ceases to be stable)"
+            f"loses stability)"
         )
         text.append(
-            f"  condition    {float(eq.condition):.3g}: some {max(0, int(digits))} digits of the "
-            f"strains are sure"
+            f"  condition    {float(eq.condition):.3g}: about {max(0, int(digits))} digits of the "
+            f"strains are accurate"
         )
         moved = float(health.tip_change)
         told = (
@@ -110,19 +111,19 @@ def health_lines(health: Health, title: str = "") -> list[str]:
     ]
     if health.independence is not None:
         text.append(
-            f"  independence {float(health.independence):.2g} of the threads (0: some do together "
-            f"what others do, 1: each its own)"
+            f"  independence {float(health.independence):.2g} of the threads (0: some are "
+            f"redundant, 1: all independent)"
         )
     text += [f"  warning      {sentence}" for sentence in health.warnings]
     return text + [f"  advice       {sentence}" for sentence in _advice(health)]
 
 
 def health_record(health: Health) -> dict[str, Any]:
-    """The health of a solve as numbers and texts, with None for what is not known.
+    """The health of a solve as numbers and strings, with None for unknown quantities.
 
-    **Returns:** `status` in words, `converged`, `margin`, `condition`, `independence`; `inputs` and
-    `loads`, each with the `factor` by which it may grow and what ends it, `then`; `tip_change` [m]
-    by finer steps; `warnings` and `advice`, lists of sentences.
+    **Returns:** `status` as a message, `converged`, `margin`, `condition`, `independence`; `inputs`
+    and `loads`, each with the largest `factor` by which they may grow and the message of the status
+    beyond it, `then`; `tip_change` [m] by finer steps; `warnings` and `advice`, lists of sentences.
     """
     eq = health.equilibrium
 
@@ -152,7 +153,7 @@ def health_record(health: Health) -> dict[str, Any]:
 
 def _reach(limit: Limit) -> str:
     if int(limit.status) == Status.CONVERGED:
-        return f"may grow together to {MOST_FACTOR:g} times and more"
+        return f"may grow together to at least {MOST_FACTOR:g} times"
     return (
         f"may grow together to {float(limit.factor):.4g} times; "
         f"then {Status(int(limit.status)).message}"
@@ -160,41 +161,41 @@ def _reach(limit: Limit) -> str:
 
 
 def _advice(health: Health) -> list[str]:
-    """What to do, worst first; that all is well if there is nothing."""
+    """Advice, the most urgent first; one sentence that says so if there is none."""
     eq, length = health.equilibrium, float(health.equilibrium.scene.rod.length)
     if not bool(eq.converged):
         return [_REMEDIES[Status(int(eq.status))].format(eq.model.finer())]
     near = [
-        f"little is missing to where it fails: {name} may grow by "
-        f"{100 * (float(limit.factor) - 1):.2g} %"
+        f"close to failure: {name} may grow by {100 * (float(limit.factor) - 1):.2g} % at most"
         for name, limit in (("inputs", health.inputs), ("loads", health.loads))
         if limit is not None and 1 <= limit.factor < 1.25
     ]
     advice = near + [
-        "the equilibrium is nearly unstable: small errors of the model move it far"
+        "the equilibrium is nearly unstable: small model errors cause large displacements"
     ] * (float(eq.stability) < 0.1)
     if not float(health.tip_change) < 1e-3 * length:
         advice.append(f"take more steps: {eq.model.finer()!r}")
     if health.independence is not None and health.independence < 1e-9:
         advice.append(
-            "threads do what others do: no shape tells all their forces (the solve is not harmed)"
+            "some threads are redundant: their forces cannot be inferred from the shape (the solve "
+            "is not affected)"
         )
-    return advice or ["all is well"]
+    return advice or ["no problems found"]
 
 
 _REMEDIES = {
-    Status.NOT_CONVERGED: "go there by degrees with vsr.follow_branch, "
-    "or look whether loads and inputs are in SI units",
-    Status.UNSTABLE: "the arm would jump: follow the branch with vsr.follow_branch, "
-    "or lower what drives it to the factor above",
+    Status.NOT_CONVERGED: "increase the inputs gradually with vsr.follow_branch, "
+    "or check that loads and inputs are in SI units",
+    Status.UNSTABLE: "the arm would snap: follow the branch with vsr.follow_branch, "
+    "or lower inputs or loads to the factor above",
     Status.COLLAPSED: "lower the tensions to the factor above, or stiffen the rod: "
-    "its axial stiffness bounds what tendons may pull",
-    Status.NOT_FINITE: "look for NaN and infinities in the scene and the inputs",
-    Status.INADMISSIBLE: "tensions and pressures may not be negative; "
+    "its axial stiffness limits the tensions",
+    Status.NOT_FINITE: "check the scene and the inputs for NaN and infinities",
+    Status.INADMISSIBLE: "tensions and pressures must not be negative; "
     "use a Thread where the force may have either sign",
-    Status.UNDER_RESOLVED: "take more steps: {!r}, or more still",
+    Status.UNDER_RESOLVED: "take more steps: {!r}, or still more",
 }
-"""What to do about a solve that failed."""
+"""Advice for a solve that failed."""
 
 
 def _threads(eq: Equilibrium) -> list[str]:
@@ -231,4 +232,4 @@ def _vector(values: Any) -> str:
 
 
 def _number(value: Any) -> str:
-    return f"{float(value) + 0.0:.6g}"  # + 0.0 makes -0 a plain 0
+    return f"{float(value) + 0.0:.6g}"  # + 0.0 turns -0 into 0

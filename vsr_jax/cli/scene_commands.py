@@ -1,4 +1,4 @@
-"""The commands that take a scene file: `solve` solves it, `check` says how healthy the solve is."""
+"""The commands for a scene file: `solve` solves it, `check` reports the health of the solve."""
 
 import argparse
 import json
@@ -35,17 +35,17 @@ from .common import (
 )
 
 MODELS = ("strain-dependent", "prescribed", "continuum")
-"""Names of the models in the order of how often they are wanted."""
+"""Names of the models, the most used first."""
 
 LEGENDRE_ORDER = 8
-"""Order of the Legendre polynomials that `--model prescribed` takes for each free strain."""
+"""Order of the Legendre polynomials of `--model prescribed`, for each free strain."""
 
 STATIONS = 41
-"""How many stations, evenly spaced from base to tip, go into a picture and a JSON file."""
+"""Stations of pictures and JSON files, evenly spaced from base to tip."""
 
 _SCENE_EXAMPLE = """
 a scene file:
-  inputs = [10.0, 5.0]                # tensions [N]; --inputs goes first
+  inputs = [10.0, 5.0]                # tensions [N]; --inputs overrides them
   [rod]
   length = 0.75                       # SI units throughout
   section = { type = "Circular", radius = { type = "Taper", base = 0.012, tip = 0.010 } }
@@ -87,12 +87,12 @@ def add_check(commands: Any) -> None:
     parser = command(
         commands,
         "check",
-        help="say how healthy the solve of a scene file is",
-        description="Solves the scene of a TOML file, and some seventy others around it. Prints "
-        "the status, the margin of stability,\n"
-        "how far inputs and loads may grow and what ends it, by how much finer steps move the "
-        "tip, and the conditioning,\n"
-        "with advice.",
+        help="report the health of the solve of a scene file",
+        description="Solves the scene of a TOML file and about seventy variants of it. Prints the "
+        "status, the stability margin,\n"
+        "how far inputs and loads may grow and how the solve fails beyond, the change of the tip "
+        "with finer steps,\n"
+        "the conditioning, and advice.",
         example="vsr-jax check scene.toml --inputs 8 2.5",
         run=_check,
     )
@@ -101,7 +101,7 @@ def add_check(commands: Any) -> None:
 
 
 def add_scene(parser: argparse.ArgumentParser) -> None:
-    """The arguments that say what is solved, and how."""
+    """Adds the arguments for the scene, its inputs and the model."""
     parser.add_argument("scene", metavar="SCENE", help="the TOML file")
     parser.add_argument(
         "--inputs",
@@ -109,13 +109,13 @@ def add_scene(parser: argparse.ArgumentParser) -> None:
         metavar="U",
         nargs="*",
         type=float,
-        help="one number an actuator (default: those of the file)",
+        help="one number per actuator (default: those of the file)",
     )
     parser.add_argument(
         "--model",
         choices=MODELS,
-        help=f"how to solve (default: vsr.solve chooses); prescribed: Legendre polynomials to "
-        f"order {LEGENDRE_ORDER} for each free strain",
+        help=f"model (default: that of vsr.solve); prescribed: Legendre polynomials up to order "
+        f"{LEGENDRE_ORDER} for each free strain",
     )
     parser.add_argument(
         "--steps",
@@ -127,7 +127,7 @@ def add_scene(parser: argparse.ArgumentParser) -> None:
         "--tolerance",
         metavar="M",
         type=float,
-        help="as many steps as bring the tip within M metres, instead of --steps",
+        help="error bound of the tip in metres, which sets the steps; instead of --steps",
     )
     add_precision(parser)
 
@@ -142,9 +142,9 @@ class SceneTask(NamedTuple):
 
 
 def task_of(options: argparse.Namespace) -> SceneTask:
-    """What is to be solved, in the precision asked for; warns of implausible numbers.
+    """The task of the command line, in the requested precision; warns about implausible numbers.
 
-    **Raises:** `ValueError` for a file or numbers that make no sense.
+    **Raises:** `ValueError` for an invalid file or invalid numbers.
     """
     set_precision(options.precision)
     scene, inputs, title = load(options.scene)
@@ -153,13 +153,12 @@ def task_of(options: argparse.Namespace) -> SceneTask:
     if inputs is None and scene.actuators:
         kinds = ", ".join(type(actuator).__name__ for actuator in scene.actuators)
         raise ValueError(
-            f"{options.scene}: holds no inputs, need --inputs, one number each for {kinds}"
+            f"{options.scene}: has no inputs, need --inputs, one number each for {kinds}"
         )
     values = jnp.asarray([] if inputs is None else inputs, options.precision)
     if options.tolerance is not None and (options.model, options.steps) != (None, None):
         raise ValueError(
-            "--tolerance: got --model or --steps too, need one or the other: a tolerance chooses "
-            "both"
+            "--tolerance: got --model or --steps too, need one or the other: a tolerance sets both"
         )
     return SceneTask(scene, values, _model(options.model, options.steps, scene), title)
 
@@ -167,7 +166,7 @@ def task_of(options: argparse.Namespace) -> SceneTask:
 def model_between(
     task: SceneTask, tolerance: float | None, low: np.ndarray, high: np.ndarray
 ) -> Model | None:
-    """The model asked for, or for inputs between two bounds the one that a tolerance takes."""
+    """The model of the task, or the one that meets a tolerance for inputs between two bounds."""
     if tolerance is None:
         return task.model
     dtype = task.inputs.dtype
@@ -221,7 +220,7 @@ def _tell(eq: Equilibrium, title: str, options: argparse.Namespace) -> None:
         ax.set_title(title)
         ax.figure.savefig(options.plot, dpi=200, bbox_inches="tight")
     elif options.plot:
-        print(f"vsr-jax: {options.plot} is not drawn, there is no shape", file=sys.stderr)
+        print(f"vsr-jax: {options.plot} is not drawn: the solve failed", file=sys.stderr)
 
 
 def save(path: str, content: Any) -> None:
@@ -236,7 +235,7 @@ def _model(name: str | None, steps: int | None, scene: Scene) -> Model | None:
         from ..models.continuum import Continuum
 
         if steps is not None:
-            raise ValueError("--steps: the continuum model chooses its steps by itself")
+            raise ValueError("--steps: not available for the continuum model, whose steps adapt")
         return Continuum()
     chosen = (
         Prescribed(Basis.uniform(Legendre(LEGENDRE_ORDER), scene.free_strains))

@@ -1,4 +1,4 @@
-"""The command `sweep`: a scene file solved for many inputs, a workspace in one command."""
+"""The command `sweep`: solves a scene file for many inputs and reports the workspace of the tip."""
 
 import argparse
 import sys
@@ -30,10 +30,10 @@ def add_sweep(commands: Any) -> None:
         commands,
         "sweep",
         help="solve a scene file for many inputs: its workspace",
-        description="Draws inputs evenly between two bounds, solves the scene of a TOML file for "
-        "each, and says where the tip gets.\n"
-        "A sweep to disk that was stopped goes on where it was when the same command is given "
-        "again. Ends with 1 where no\n"
+        description="Draws inputs uniformly between two bounds, solves the scene of a TOML file "
+        "for each, and prints the extent\n"
+        "of the tip positions. The same command resumes an interrupted sweep to disk. The exit "
+        "status is 1 if no\n"
         "sample converged.",
         example="vsr-jax sweep scene.toml --samples 100000 --high 10 5 --out workspace.zarr "
         "--plot workspace.png",
@@ -45,18 +45,18 @@ def add_sweep(commands: Any) -> None:
         metavar="N",
         type=positive_integer,
         default=10_000,
-        help="how many (default: %(default)s)",
+        help="number of samples (default: %(default)s)",
     )
     add_bounds(parser, "--inputs, or those of the file")
     parser.add_argument(
-        "--seed", type=int, default=0, help="of the random numbers (default: %(default)s)"
+        "--seed", type=int, default=0, help="seed of the random inputs (default: %(default)s)"
     )
     parser.add_argument(
         "--outputs",
         nargs="+",
         choices=known_outputs(),
         default=["tip"],
-        help="what to keep besides the status (default: tip)",
+        help="quantities to store besides the status (default: tip)",
     )
     parser.add_argument(
         "--out",
@@ -91,7 +91,7 @@ def _sweep(options: argparse.Namespace) -> int:
     seconds = time.perf_counter() - start
     tips = np.asarray(result["tip"])[:, :3, 3]
     print("\n".join(_lines(task.title or options.scene, low, high, result, tips)))
-    print(f"time        {seconds:.1f} s, compiling included")
+    print(f"time        {seconds:.1f} s, including compilation")
     if options.plot:
         _draw(options.plot, task.title, tips, inputs, low, high)
     return DONE if np.any(result.converged) else NOT_CONVERGED
@@ -100,7 +100,7 @@ def _sweep(options: argparse.Namespace) -> int:
 def _lines(
     title: str, low: np.ndarray, high: np.ndarray, result: Sweep, tips: np.ndarray
 ) -> list[str]:
-    """What a sweep found, in words."""
+    """The report of a sweep."""
     ranges = ", ".join(f"{a:g} to {b:g}" for a, b in zip(low, high, strict=True))
     counts = ", ".join(f"{number:,} {status}" for status, number in result.counts.items())
     lines = [title, f"inputs      {ranges}", f"samples     {counts}"]
@@ -116,7 +116,7 @@ def _draw(
     matplotlib.use("Agg")
     from ..viz import plot
 
-    varied = high != low  # of many inputs the mean says nothing
+    varied = high != low  # the mean of many inputs carries no information
     share = (
         np.mean((inputs - low)[:, varied] / (high - low)[varied], axis=1)
         if 0 < np.sum(varied) < 4

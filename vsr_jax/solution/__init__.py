@@ -1,6 +1,6 @@
 """One equilibrium: the solve, the table of its quantities, its stability margin and its error.
 
-Must not know of many solves: what needs them lies in `analysis`.
+Must not import code that needs several solves; that code is in `analysis`.
 """
 
 from .energy import Energy

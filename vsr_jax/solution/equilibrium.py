@@ -1,5 +1,4 @@
-"""What a solve returns: the status, and the quantities of the table, each computed when asked
-for."""
+"""The result of a solve: the status, and the quantities of the table, each computed on demand."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -35,15 +34,15 @@ from .summary import Summary, summary_of
 class Equilibrium(Solved):
     """A solved scene.
 
-    Every quantity is computed when it is asked for, so that a program that only needs the tip
-    computes only the tip; each is a program of its own, and `summary` computes many in one. Where
-    the solve failed every quantity is NaN and `status` gives the reason. A quantity at abscissas
-    X [m] takes one or several in a row, from 0 to the arm's length. It raises `ValueError` for an X
-    beyond the arm where both are known, and is NaN there under `jax.jit`.
+    Each quantity is computed on demand by its own compiled program: a program that only needs the
+    tip computes only the tip. `summary` computes many quantities in one program. Where the solve
+    failed, every quantity is NaN and `status` gives the reason. A quantity at abscissas X [m] takes
+    a scalar or a 1-D array with values from 0 to the arm's length. It raises `ValueError` for an X
+    beyond the arm if both are concrete, and is NaN there under `jax.jit`.
 
-    **Fields:** `scene`, `inputs` [of the actuators], `model`; `status`, a `Status` as an integer;
-    `steps`, the Newton steps taken (integration steps for `Continuum`); `state`, of the
-    model, in a form of its own.
+    **Fields:** `scene`, `inputs` [units of the actuators], `model`; `status`, a `Status` as an
+    integer; `steps`, the number of Newton steps (integration steps for `Continuum`); `state`, the
+    internal state of the model.
     """
 
     scene: Scene
@@ -62,17 +61,17 @@ class Equilibrium(Solved):
 
     @property
     def message(self) -> str:
-        """The status in words."""
+        """Message of the status."""
         return Status(int(self.status)).message
 
     def summary(self, X: VectorLike = 61, values: Sequence[str] = ()) -> Summary:
-        """Everything along the arm, and any other quantities, from one compiled program.
+        """All quantities along the arm, and selected other ones, from one compiled program.
 
-        **Arguments:** `X`: how many stations, evenly spaced on the arm, or their abscissas [m];
+        **Arguments:** `X`: number of stations, evenly spaced on the arm, or their abscissas [m];
         `values`: names of quantities that are not functions of X, as in `("tip", "stability")`.
 
         **Returns:** a `Summary`, with every quantity along the arm as an attribute, and the
-        threads and the wall in space.
+        positions of the threads and of the outer wall.
 
         **Raises:** `ValueError` for a batch of equilibria, abscissas beyond the arm, and an unknown
         name.
@@ -107,7 +106,7 @@ class Equilibrium(Solved):
     @along_arm("N m and N", "wrench")
     def reaction(self, X: Array) -> Float[Array, "stations 6"]:
         r"""Internal wrench $\Lambda(X) = (M, N)$ in the body frame that balances the loads beyond
-        X. Rod and threads carry it together."""
+        X. The rod and the threads carry it together."""
         nodes = self.nodes
         loads = loading(self.scene, nodes.grid)
         if loads is None:
@@ -118,16 +117,16 @@ class Equilibrium(Solved):
     def stability(self) -> Scalar:
         r"""Stability margin, the least eigenvalue of the scaled tangent stiffness.
 
-        That is $\Sigma^{-1/2} (\Sigma - A) \Sigma^{-1/2}$ over the nodes; where loads tie the nodes
-        to each other, the whole tangent scaled the same way (its symmetric part) among the changes
-        of strain that taut cables of given length allow.
+        The matrix is $\Sigma^{-1/2} (\Sigma - A) \Sigma^{-1/2}$ at each node. Where loads couple
+        the nodes, it is the symmetric part of the whole tangent, scaled the same way and restricted
+        to the changes of strain that taut cables of given length allow.
 
-        1 for an arm without forces, at least 1 for tendons alone up to rounding, 0 where the
-        equilibrium ceases to be stable. Loads that have no potential (dead moments in space,
-        follower loads) leave a part that is not symmetric: with them a margin below 0 does not
-        prove instability. With loads it is found by Lanczos' method, and NaN in the rare case that
-        its residual stays above the root of the machine's epsilon. Where the least eigenvalue is
-        multiple it has no derivative.
+        The margin is 1 for an arm without forces, at least 1 for tendons alone up to rounding, and
+        0 where the equilibrium loses stability. Loads without a potential (dead moments in space,
+        follower loads) make the tangent nonsymmetric: with them a margin below 0 does not prove
+        instability. With loads the margin comes from the Lanczos method; it is NaN in the rare case
+        that the residual stays above the square root of machine epsilon. It has no derivative where
+        the least eigenvalue is multiple.
         """
         return extreme(self.scene, self.sound_forces, self.nodes)
 
@@ -148,9 +147,10 @@ class Equilibrium(Solved):
     def energy(self) -> Energy:
         r"""Potential energy [J]: elastic, of stretched cables, of the actuation, of the loads.
 
-        The potential $\Pi$ that is stationary at the equilibrium, in four parts and their `total`;
-        see `Energy`. Follower loads and dead moments have no potential and are not counted; with
-        friction no potential exists, and the actuation's part is $-\int \tau |t_c| dX$.
+        The potential $\Pi$ is stationary at the equilibrium; it is returned in four parts and their
+        `total`, see `Energy`. Follower loads and dead moments have no potential and are left out.
+        With friction no potential exists, and the part of the actuation is
+        $-\int \tau |t_c| dX$.
         """
         nodes, points = self.nodes, [x for x, _ in self.scene.point_wrenches("world")]
         X = jnp.concatenate([nodes.grid.X.reshape(-1), jnp.array(points, self.inputs.dtype)])
@@ -195,10 +195,10 @@ class Equilibrium(Solved):
     def thread(self, index: int, X: VectorLike) -> Float[Array, "... 3"]:
         """Position [m] of thread `index` where it crosses the sections at X: $r + R d$.
 
-        **Arguments:** `index`: place of its actuator in the scene, from 0; `X` [m]: between the
-        thread's start and end.
+        **Arguments:** `index`: index of its actuator in the scene, from 0; `X` [m]: between the
+        start and the end of the thread.
 
-        **Raises:** `ValueError` for another index, and for a known X where the thread is not (NaN
+        **Raises:** `ValueError` for an invalid index, and for a concrete X outside the thread (NaN
         under `jax.jit`).
         """
         X, number = abscissas(self, X), len(self.scene.actuators)
@@ -208,7 +208,7 @@ class Equilibrium(Solved):
             or not 0 <= index < number
         ):
             raise ValueError(
-                f"index: got {index!r}, need the place of one of the scene's {number} actuators, "
+                f"index: got {index!r}, need the index of one of the scene's {number} actuators, "
                 f"counted from 0"
             )
         on_arm("X", X, self.scene.rod.length, self._ends(int(index)), f"thread {index}")
@@ -248,11 +248,11 @@ class Equilibrium(Solved):
 
     @property
     def nodes(self) -> Nodes:
-        """The quadrature points of the model, with strain and cross-sections there."""
+        """Quadrature points of the model, with the strain and the cross-sections there."""
         return self.model.nodes(self.scene, self.sound_forces, self.state)
 
     def _ends(self, index: int) -> tuple[Any, Any]:
-        """Where a thread begins and ends [m]."""
+        """Abscissas [m] of the start and the end of a thread."""
         actuator = self.scene.actuators[index]
         start, end = actuator.start, actuator.end
         return 0.0 if start is None else start, self.scene.rod.length if end is None else end

@@ -1,15 +1,16 @@
-r"""How far a solution is from the exact one: its tip and its strain against those of a coarser one,
-or of a finer one.
+r"""Discretisation error of a solution: its tip and its strain are compared with those of a coarser
+or a finer solution.
 
-- Without loads, on an arm that is one smooth piece, a model whose sections are balanced errs in its
-  steps alone. Each two of them make one, with the strain at its nodes by the polynomial through
-  theirs: no balance is solved, and the tip moves by $2^p - 1$ times its error for steps of order p.
-  Four times as much is estimated, since few steps are not yet in that regime.
-- Otherwise a finer solution starts from the one at hand and is not solved anew. Without loads its
-  cross-sections are balanced at twice as many steps of order 6. With loads, lengths or friction
-  their strain follows from the solution's own reaction, and is then corrected by Newton steps of
-  the whole arm with its approximate tangent, which leave a tenth of what was wrong or less.
-- Errors of `Continuum` come from an integration whose tolerances are a hundred times tighter.
+- Without loads, on an arm that is one smooth piece, a model with balanced sections has no error but
+  that of its steps. Pairs of steps are merged into one, with the strain at the new nodes
+  interpolated by the polynomial through the old ones: no balance is solved, and the tip moves by
+  $2^p - 1$ times its error for steps of order p. The estimate is four times that error, because a
+  few steps are not yet in the asymptotic regime.
+- Otherwise a finer solution starts from the given one, which saves a full solve. Without loads its
+  cross-sections are balanced at twice as many steps of order 6. With loads, lengths or friction the
+  strain there follows from the reaction of the given solution. It is then corrected by Newton steps
+  of the whole arm with the approximate tangent, which leave a tenth of the error or less.
+- For `Continuum` the reference is an integration with tolerances a hundred times tighter.
 """
 
 from typing import Any, NamedTuple
@@ -31,26 +32,35 @@ from ..numerics.quadrature import Grid, make_grid, merging
 from ..typing import Pose, Scalar, cast
 
 _SAFETY = 1.5
+"""Safety factor on the estimated differences."""
+
 _ROUNDED = 8
+"""Bound on rounding, in units of machine epsilon."""
+
 _PASSES = 3
+"""Newton steps that correct the finer strain."""
+
 _UNSETTLED = 4
-"""Factor by which the errors of steps and of steps twice as long may be apart from what their order
-says."""
+"""Factor by which the ratio of the errors of steps and of steps twice as long may differ from that
+of their order."""
 
 
 class Error(NamedTuple):
-    """Estimates of a solution's errors: that of the tip's place [m], and the largest along the arm
-    of each strain, angular first ([1/m], [-])."""
+    """Estimated errors of a solution.
+
+    **Fields:** `tip`: of the tip position [m]; `strain`: largest error along the arm of each
+    strain, angular first ([1/m], [-]).
+    """
 
     tip: Scalar
     strain: Float[Array, " 6"]
 
 
 def error_of(model: Model, scene: Scene, inputs: Array, forces: Vector, state: Any) -> Error:
-    """Estimate of a solution's errors: one and a half times the difference to a finer one, as far
-    as it is known; not less than rounding.
+    """Estimated errors of a solution: 1.5 times its estimated difference from a finer one, plus a
+    bound on rounding.
 
-    **Arguments:** as `Model.tip`, and the inputs that were solved for.
+    **Arguments:** as `Model.tip`, and `inputs`, those of the solve.
     """
     scene, inputs, forces, state = lax.stop_gradient((scene, inputs, forces, state))
     share = 1.0
@@ -85,12 +95,12 @@ def error_of(model: Model, scene: Scene, inputs: Array, forces: Vector, state: A
 
 
 def _by_pairs(model: SteppedModel, scene: Scene) -> bool:
-    """Whether steps can be taken in twos."""
+    """Whether pairs of steps can be merged."""
     return not scene.coupled and scene.edges().size == 2 and model.steps > 1
 
 
 def _paired_tip(xi: Vector, grid: Grid, scene: Scene) -> Pose:
-    """Pose of the tip by steps twice as long; the last stays as it is where their number is odd."""
+    """Pose of the tip by steps twice as long; an odd last step keeps its length."""
     pairs = grid.h.size // 2 * 2
     merged = tuple(
         jnp.asarray(merging(len(x)), x.dtype) @ jnp.concatenate([x[:, 0:pairs:2], x[:, 1:pairs:2]])
@@ -107,7 +117,7 @@ def _paired_tip(xi: Vector, grid: Grid, scene: Scene) -> Pose:
 def _corrected(
     model: SteppedModel, scene: Scene, inputs: Array, forces: Vector, state: Any
 ) -> tuple[Vector, Vector, Grid]:
-    """Strain of a solution at the nodes of a finer grid, the strain in balance there, and the
+    """Strain of a solution at the nodes of a finer grid, the balanced strain there, and the
     grid."""
     grid = make_grid(scene.edges(model.breakpoints(scene)), 2 * model.steps, 3)
     xi = model.strain(scene, forces, state, grid.X.reshape(-1))

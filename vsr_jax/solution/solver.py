@@ -1,4 +1,4 @@
-"""The one entry: a scene and its inputs in, an equilibrium out."""
+"""`solve`: the equilibrium of a scene under its inputs."""
 
 from typing import Any
 
@@ -16,8 +16,8 @@ from .step_choice import choose
 
 
 class SolveError(RuntimeError):
-    """Raised by `solve(..., throw=True)` when no equilibrium was found; its text is the status in
-    words."""
+    """Raised by `solve(..., throw=True)` if no equilibrium was found; its text is the message of
+    the status."""
 
 
 def solve(
@@ -33,25 +33,25 @@ def solve(
     $\Pi(\xi) = \int_0^L \frac12 (\xi - \xi^*)^T \Sigma (\xi - \xi^*) \, dX - \sum_i \tau_i
     l_i(\xi)$,
 
-    with $l_i$ the length of thread i. One scene at a time; batch with `jax.vmap`. Derivatives of
-    everything that comes back, with respect to every number of the scene and to the inputs, are
-    implicit and go in forward and reverse mode.
+    with $l_i$ the length of thread i. Solves one scene; batch with `jax.vmap`. All results are
+    differentiable with respect to every number of the scene and to the inputs, by implicit
+    differentiation in forward and reverse mode.
 
     **Arguments:**
     - `scene`: rod and actuators.
-    - `inputs`: one number an actuator: tau [N] for a `Thread`, tension [N] for a `Tendon`, pressure
-      [Pa] for a `Chamber`. Their dtype is the precision of the whole computation.
+    - `inputs`: one number per actuator: tau [N] for a `Thread`, tension [N] for a `Tendon`,
+      pressure [Pa] for a `Chamber`. Their dtype is the precision of the whole computation.
     - `model`: `StrainDependent()` by default, the exact one; `Prescribed(basis)`; `Continuum()`.
-    - `tolerance` [m]: of the tip's place, instead of a `model`: as many steps as it takes for these
-      inputs, found by trying (see `plan`, which also chooses for ranges of inputs and for
-      gradients, and beforehand, as `jax.jit` needs it). What was chosen is the `model` of the
-      result; `eq.error` says what came of it.
-    - `throw`: raise if the solve did not converge. Otherwise the status says so and the shape is
-      NaN.
+    - `tolerance` [m]: error bound of the tip position, instead of a `model`. The number of steps is
+      chosen for these inputs by trial solves. `plan` does the same ahead of `jax.jit`, for ranges
+      of inputs and for gradients. The result's `model` is the chosen one, `eq.error` its estimated
+      error.
+    - `throw`: raise if the solve did not converge. Otherwise `status` gives the reason and the
+      shape is NaN.
 
-    **Raises:** `ValueError` for a wrong number of inputs and, where their values are known, for NaN
-    or a tension < 0; for a tolerance that no number of steps meets, or together with a model.
-    `SolveError` with `throw=True`; under `jax.jit` the error equinox raises at run time.
+    **Raises:** `ValueError` for a wrong number of inputs and, if their values are concrete, for NaN
+    or a tension < 0; for a tolerance that no number of steps meets; for a tolerance together with a
+    model. `SolveError` with `throw=True`; under `jax.jit`, the run-time error of equinox.
 
     **Source:** eq. (8)-(21) of Renda et al. 2020.
     """
@@ -67,8 +67,8 @@ def _model(scene: Scene, inputs: Array, model: Model | None, tolerance: float | 
     if tolerance is not None:
         if model is not None:
             raise ValueError(
-                f"tolerance: got {tolerance!r} and a model, need one of them: a model says itself "
-                f"how fine it is"
+                f"tolerance: got {tolerance!r} and a model, need one of them: a model already "
+                f"fixes the resolution"
             )
         found = choose(scene, positive("tolerance", tolerance), inputs[None])
         return StrainDependent() if found is None else found.model
@@ -81,8 +81,8 @@ def _model(scene: Scene, inputs: Array, model: Model | None, tolerance: float | 
 
 @eqx.filter_jit
 def outcome_of(scene: Scene, inputs: Float[Array, " inputs"], model: Model) -> Outcome:
-    """What a model makes of inputs, those that an actuator cannot exert refused by their status;
-    all in one precision."""
+    """Outcome of a model; all arguments have one precision. NaN and inputs that an actuator cannot
+    exert get their own status."""
     finite, admitted = jnp.all(jnp.isfinite(inputs)), scene.admits(inputs)
     outcome = resolved(model, scene, model.solve(scene, jnp.where(finite & admitted, inputs, 0.0)))
     status = jnp.where(admitted, outcome.status, Status.INADMISSIBLE)

@@ -1,18 +1,18 @@
-r"""Eigenvalues of the tangent stiffness, scaled so that an arm without forces has 1: the least is
-the stability margin.
+r"""Eigenvalues of the tangent stiffness, scaled so that an arm without forces has the eigenvalue 1;
+the least is the stability margin.
 
-Where loads tie the nodes to each other, a change $\delta\xi = (\kappa, \upsilon)$ of the strain
-turns the sections in the world frame by $\theta = \int R \kappa \, dX$. With $(m, n)$ the wrench
-there and $p'$ the axis, all in the world frame, the residual changes by
+Where loads couple the nodes, a change $\delta\xi = (\kappa, \upsilon)$ of the strain
+rotates the sections in the world frame by $\theta = \int R \kappa \, dX$. With the wrench
+$(m, n)$ and the derivative $p'$ of the axis, all in the world frame, the residual changes by
 
 $$\delta r = H \, \delta\xi - (R^T (\delta m - \theta \times m),
 R^T (\delta n - \theta \times n)), \quad
 -\delta n' = \theta \times f, \quad -\delta m' = (\theta \times p' + R \upsilon) \times n + p'
 \times \delta n + \theta \times c,$$
 
-where c and f are the densities that follow the arm. The product with the tangent is thus a few sums
-along the arm. It is the exact derivative of the discrete residual: $\theta$ is that of the Magnus
-steps.
+where c and f are the densities of the follower loads. A product with the tangent thus takes a few
+sums along the arm. It is the exact derivative of the discrete residual: $\theta$ is that of the
+Magnus steps.
 """
 
 from functools import partial
@@ -46,12 +46,12 @@ from ..numerics.se3 import exp_coefficients, rotation_components
 
 
 def extreme(scene: Scene, forces: Vector, nodes: Nodes, *, greatest: bool = False) -> Array:
-    r"""Least eigenvalue of $\Sigma^{-1/2} H \Sigma^{-1/2}$, or the greatest: of each node alone, or
-    with loads of all together.
+    r"""Least or greatest eigenvalue of $\Sigma^{-1/2} H \Sigma^{-1/2}$: node by node without loads,
+    of the whole arm with loads.
 
-    Coupled, it is that of the symmetric part of the whole tangent among the changes of strain that
-    the taut cables allow; NaN where it is not found. Without loads cables do not count: they are
-    finitely many, and no number of them stiffens every section.
+    With loads it is that of the symmetric part of the whole tangent, restricted to the changes of
+    strain that the taut cables allow; NaN if the Lanczos method does not converge. Without loads
+    cables are ignored: a finite number of them cannot stiffen every section.
     """
     if scene.loads:
         return _extreme(arm_of(scene, forces, nodes), -1 if greatest else 0)
@@ -64,8 +64,8 @@ def extreme(scene: Scene, forces: Vector, nodes: Nodes, *, greatest: bool = Fals
 
 
 class Arm(eqx.Module):
-    """What the tangent of all nodes together is made of: strain, cross-sections, thread forces and
-    loads at the nodes of a grid.
+    """Data of the tangent of the whole arm: strain, cross-sections, thread forces and loads at the
+    nodes of a grid.
 
     `units` scales changes of the free strains, $\\Sigma^{-1/2} W^{-1/2}$ with W the weights of the
     nodes; `taut`: see `ScaledTangent`.
@@ -81,7 +81,7 @@ class Arm(eqx.Module):
     free: tuple[int, ...] = eqx.field(static=True)
 
     def tangent(self) -> "ScaledTangent":
-        """The operator whose eigenvalues are wanted."""
+        """The scaled tangent as an operator."""
         lower = tangent(self.xi, self.sections, self.tau)
         return ScaledTangent(
             lower,
@@ -93,8 +93,8 @@ class Arm(eqx.Module):
         )
 
     def form(self, v: Array) -> Array:
-        """$v^T S v$ with S the scaled tangent, by differentiation of the residual: less to compile
-        where it is differentiated itself."""
+        """$v^T S v$ with S the scaled tangent, by differentiation of the residual: its derivative
+        compiles faster than that of the operator."""
 
         def imbalance(xi: Vector) -> Vector:
             return residual(xi, self.sections, self.tau, react(xi, self.grid, self.loads).wrench)
@@ -115,8 +115,11 @@ def _extreme_jvp(place: int, primals: tuple[Arm], tangents: tuple[Arm]) -> tuple
 
 
 class _Following(NamedTuple):
-    """A wrench (M, F) at the end of a step, in the world frame: 1 for that end among the starts of
-    steps and the tip, 1 at the nodes before it."""
+    """A follower point wrench in the world frame.
+
+    **Fields:** `end`: 1 at its place among the starts of the steps and the tip; `before`: 1 at the
+    nodes between the base and that place; `wrench`: (M, F).
+    """
 
     end: Float[Array, " steps_and_one"]
     before: Float[Array, "stages steps"]
@@ -124,11 +127,14 @@ class _Following(NamedTuple):
 
 
 class _Along(NamedTuple):
-    r"""What the loads make of a change of strain, in the world frame: `rotation` R, `wrench` (m, n)
-    and `axis` p' at the nodes; the density (c, f) and the point wrenches that follow the arm; the
-    turn of each node from the start of its step, and of each step, by the angular strains
-    (component and stage) at the step's nodes; the integral from each node to the tip by the values
-    at all."""
+    r"""Linearisation of the reaction with respect to the strain, in the world frame.
+
+    **Fields:** `rotation` R, `wrench` (m, n) and `axis` p' at the nodes; `follower`: density
+    (c, f) of the follower loads; `points`: follower point wrenches; `turn`, `step_turn`:
+    derivatives of the rotation of each node from the start of its step, and of each step, with
+    respect to the angular strains (component and stage) at the nodes of the step; `beyond`: matrix
+    that takes values at the nodes to their integrals from each node to the tip.
+    """
 
     rotation: Matrix
     wrench: Vector
@@ -142,10 +148,11 @@ class _Along(NamedTuple):
 
 class ScaledTangent(Operator):
     r"""Symmetric part of $W^{1/2} \Sigma^{-1/2} (\partial r / \partial \xi) \Sigma^{-1/2} W^{-1/2}$
-    with W the weights of the nodes, on arrays of the shape (free strains, stages, steps).
+    with W the weights of the nodes, on arrays of shape (free strains, stages, steps).
 
-    Not allowed are changes of strain at nodes without weight, of pieces of the arm without length,
-    and those that shorten the path of a taut cable (`taut`: orthonormal, zero for slack ones).
+    Excluded are changes of strain at nodes of zero weight, from pieces of the arm of zero length,
+    and those that change the path length of a taut cable (`taut`: orthonormal, zero for slack
+    ones).
     """
 
     lower: Matrix
@@ -181,7 +188,7 @@ def _projected(v: Array, units: Array, taut: tuple[Array, ...]) -> Array:
 
 
 def arm_of(scene: Scene, forces: Vector, nodes: Nodes) -> Arm:
-    """The arm at a solution, or at any other strain."""
+    """Data of the tangent at a solution, or at any other strain."""
     sections, grid, free = nodes.sections, nodes.grid, scene.free
     loads = loading(scene, grid)
     assert loads is not None
@@ -209,7 +216,7 @@ def arm_of(scene: Scene, forces: Vector, nodes: Nodes) -> Arm:
 
 
 def _along(xi: Vector, grid: Grid, loads: Loading) -> _Along:
-    """The reaction and all that its change is made of."""
+    """The reaction and the derivatives that its change needs."""
     steps, size = grid.h.size, grid.X.size
     now = react(xi, grid, loads)
     unit = jnp.eye(size, dtype=grid.h.dtype).reshape(*grid.X.shape, size)
@@ -231,8 +238,8 @@ def _along(xi: Vector, grid: Grid, loads: Loading) -> _Along:
 
 
 def _turns(k: Vector, grid: Grid, starts: Matrix, rotation: Matrix) -> tuple[Vector, Vector]:
-    """Derivatives of the turn of the nodes from the start of their step, and of the steps, by each
-    angular strain in the step."""
+    """Derivatives of the rotation of the nodes from the start of their step, and of the steps, with
+    respect to each angular strain in the step."""
     stages = grid.X.shape[0]
     share = jnp.asarray(gauss_legendre(stages)[0], grid.h.dtype)[:, None]
 
@@ -255,15 +262,15 @@ def _turns(k: Vector, grid: Grid, starts: Matrix, rotation: Matrix) -> tuple[Vec
 
 
 def _turn(omega: Vector, change: Vector) -> Vector:
-    r"""Turn $\epsilon$ in the body frame by a change of a rotation vector, $\tilde\epsilon = R^T
-    \delta R$ for $R = \exp \tilde\omega$."""
+    r"""Rotation $\epsilon$ in the body frame due to a change of a rotation vector,
+    $\tilde\epsilon = R^T \delta R$ for $R = \exp \tilde\omega$."""
     _, b, c3 = exp_coefficients(c.dot(omega, omega))
     across = c.cross(omega, change)
     return c.add(change, c.subtract(c.scale(c3, c.cross(omega, across)), c.scale(b, across)))
 
 
 def _reaction_change(x: Vector, along: _Along) -> Vector:
-    r"""Change of the reaction $\Lambda$ by a change of the strain, to first order."""
+    r"""First-order change of the reaction $\Lambda$ due to a change of the strain."""
     shape, steps = x[0].shape, x[0].shape[1]
     kappa = jnp.stack(x[:3]).reshape(-1, steps)
     before = jnp.asarray(np.triu(np.ones((steps, steps + 1)), 1), kappa.dtype)

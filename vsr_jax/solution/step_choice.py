@@ -1,9 +1,9 @@
-r"""How many steps a tolerance takes: tried out on the scene itself, all numbers of steps in one
-compiled program.
+r"""Number of steps that meets a tolerance, found by trial solves of the scene; one compiled program
+covers all numbers of steps.
 
-The steps are of order 6. A grid with room for many of them leaves those empty that are not wanted,
-so their number may be traced. The reference of each trial is the same arm with as many steps as
-there is room for; where these are not enough, there is room for four times as many in the next.
+The steps are of order 6. A grid has a fixed capacity and leaves unused steps empty, so that the
+number of steps may be traced. The reference of each trial is the same arm with all steps of the
+grid in use. If these are not enough, the next trial has four times the capacity.
 """
 
 from itertools import product
@@ -25,6 +25,8 @@ from ..typing import cast
 from ..validation import instance, interval, is_traced, positive
 
 _ROOMS = (64, 256, 1024)
+"""Capacities of the trial grids, in steps."""
+
 _LADDER = (
     1,
     2,
@@ -54,28 +56,32 @@ _LADDER = (
     44,
     48,
 )
-"""Numbers of steps that are tried where there is room for 64; with more room they grow alike."""
+"""Numbers of steps to try with a capacity of 64; larger capacities scale them."""
 
 _SHARE = 0.5
-"""Share of a tolerance that the samples may take up: other inputs may ask for more."""
+"""Largest error of the samples, as a share of the tolerance: other inputs may have a larger
+error."""
 
 _SAMPLES = 16
+"""Trial inputs per plan."""
+
 _NOTICED = 0.01
+"""Least effect of a number, as a share of the largest, for its derivative to count."""
+
 _ROUNDED = 1e-5
 """Tolerance, as a share of the length, below which single precision is not tried."""
 
 
 class Plan(NamedTuple):
-    """What `plan` chose.
+    """Result of `plan`.
 
-    - `model`: for `solve(..., model=plan.model)`; static, so that it goes through `jax.jit`,
+    - `model`: for `solve(..., model=plan.model)`; static, so that it works under `jax.jit`,
       `jax.vmap` and `jax.grad`.
-    - `dtype`: "float32" or "float64", the least precision that will do: give the inputs in it.
-      Single precision is tried where the inputs are double, and only if no gradient tolerance is
-      asked for.
-    - `error` [m]: the largest error of the tip's place that was found for it.
-    - `gradient_error`: the largest relative error of a derivative of the tip's place, None where
-      none was asked for.
+    - `dtype`: "float32" or "float64", the lowest sufficient precision: pass the inputs in it.
+      Single precision is only tried if the inputs are double and no gradient tolerance is given.
+    - `error` [m]: largest error of the tip position over the samples.
+    - `gradient_error`: largest relative error of a derivative of the tip position; None without a
+      gradient tolerance.
     """
 
     model: StrainDependent
@@ -87,22 +93,23 @@ class Plan(NamedTuple):
 def plan(
     scene: Scene, tolerance: float, inputs_range: Any, *, gradient_tolerance: float | None = None
 ) -> Plan:
-    """The fewest steps with which the tip's place holds to `tolerance` for inputs within a range.
+    """The fewest steps that bring the tip position within `tolerance` for inputs in a range.
 
-    They are tried out on the corners of the range and between them, up to 16 samples in all, and
-    meet half the tolerance there. Samples without a stable equilibrium do not count.
+    Trial solves at corners and at random points of the range, up to 16 samples in all, meet half
+    the tolerance. Samples without a stable equilibrium are ignored.
 
     **Arguments:**
-    - `scene`: with known numbers; a plan holds for scenes near it too.
-    - `tolerance` [m]: of the tip's place.
-    - `inputs_range`: the least and the greatest inputs, a pair of numbers or of arrays with one
-      number an actuator. Their dtype is the precision.
-    - `gradient_tolerance`: the relative error that the derivatives of the tip's place by the
-      scene's numbers and by the inputs may have. Those by a number p that is zero, or with an
-      effect $|p| |\\partial x / \\partial p|$ below a hundredth of the greatest, do not count.
+    - `scene`: with concrete numbers; a plan also holds for scenes near it.
+    - `tolerance` [m]: error bound of the tip position.
+    - `inputs_range`: lower and upper bound of the inputs, a pair of numbers or of arrays with one
+      number per actuator. Their dtype is the precision.
+    - `gradient_tolerance`: bound on the relative error of the derivatives of the tip position with
+      respect to the scene's numbers and to the inputs. Derivatives with respect to a number p that
+      is zero, or whose effect $|p| |\\partial x / \\partial p|$ is below 1 % of the largest, are
+      ignored.
 
-    **Raises:** `ValueError` for arguments that make no sense, for a tolerance that 768 steps do not
-    meet or that is beyond the precision, and where no sample has a stable equilibrium.
+    **Raises:** `ValueError` for invalid arguments, for a tolerance that 768 steps do not meet or
+    that is below the precision, and if no sample has a stable equilibrium.
     """
     instance("scene", scene, Scene, "a Scene")
     tolerance = positive("tolerance", tolerance)
@@ -110,15 +117,15 @@ def plan(
         gradient_tolerance = positive("gradient_tolerance", gradient_tolerance)
     if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, inputs_range))):
         raise ValueError(
-            "scene, inputs_range: got numbers that are traced, need known ones: make the plan "
-            "before jax.jit"
+            "scene, inputs_range: got traced numbers, need concrete ones: make the plan outside "
+            "jax.jit"
         )
     samples = _samples(scene, inputs_range)
     chosen = choose(scene, tolerance, samples, gradient_tolerance)
     if chosen is None:
         raise ValueError(
-            "inputs_range: got no sample that has a stable equilibrium, need a range with some; "
-            "solve one to see why"
+            "inputs_range: got no sample with a stable equilibrium, need a range with some; solve "
+            "one sample and read its status"
         )
     if (
         samples.dtype != np.float64
@@ -133,12 +140,12 @@ def plan(
 def choose(
     scene: Scene, tolerance: float, samples: Array, gradient_tolerance: float | None = None
 ) -> Plan | None:
-    """The plan for some samples of inputs, shape (samples, inputs); None where none of them has an
+    """The plan for samples of inputs, shape (samples, inputs); None if no sample has an
     equilibrium."""
     if any(is_traced(leaf) for leaf in jax.tree.leaves((scene, samples))):
         raise ValueError(
-            "tolerance: got a scene or inputs that are traced, need known numbers; under jax.jit "
-            "use a vsr.plan made before"
+            "tolerance: got a traced scene or traced inputs, need concrete numbers; under jax.jit "
+            "use the result of an earlier vsr.plan"
         )
     scene, least, most = cast(scene, samples.dtype), np.inf, _LADDER[-1] * _ROOMS[-1] // _ROOMS[0]
     for room in _ROOMS:
@@ -170,7 +177,7 @@ def choose(
     if least <= _SHARE * tolerance:
         raise ValueError(
             f"gradient_tolerance: got {gradient_tolerance:g}, which {most} steps do not meet, "
-            f"need a greater one"
+            f"need a larger one"
         )
     raise ValueError(
         f"tolerance: got {tolerance:g} m, need at least {least / _SHARE:.2g} m, the best of up to "
@@ -179,13 +186,13 @@ def choose(
 
 
 def _worst(errors: np.ndarray) -> np.ndarray:
-    """Largest error over the samples for each number of steps, and for all greater numbers: chance
-    finds small errors too."""
+    """Largest error over the samples, and over all numbers of steps from the given one up: a single
+    small error may be a coincidence."""
     return np.maximum.accumulate(np.max(np.nan_to_num(errors, nan=np.inf), axis=0)[::-1])[::-1]
 
 
 def _samples(scene: Scene, inputs_range: Any) -> Array:
-    """Corners of the range, as many as there is room for, and inputs between them."""
+    """Corners of the range, all or a random selection, and random inputs between them."""
     size = len(scene.actuators)
     low, high = interval("inputs_range", inputs_range, size)
     scene.check_inputs(low)
@@ -203,8 +210,8 @@ def _samples(scene: Scene, inputs_range: Any) -> Array:
 
 
 def _rounding(scene: Scene, samples: Array, model: StrainDependent) -> float:
-    """Greatest distance [m] of the tip in single precision from that in double; infinite where a
-    solve is lost."""
+    """Largest distance [m] between the tips in single and in double precision; infinite if a solve
+    fails in single precision only."""
     tips, rounded = (
         np.asarray(_tips(cast(scene, dtype), samples.astype(dtype), model))
         for dtype in (jnp.dtype("float64"), jnp.dtype("float32"))
@@ -219,7 +226,7 @@ def _tips(scene: Scene, samples: Array, model: StrainDependent) -> Array:
 
 
 class _Trial(StrainDependent):
-    """Steps of which only the first `wanted` are not empty."""
+    """Steps of which only the first `wanted` have a length."""
 
     wanted: Array
 
@@ -232,7 +239,7 @@ class _Trial(StrainDependent):
 
 
 def _tip_of(scene: Scene, inputs: Array, model: StrainDependent) -> tuple[Array, Array]:
-    """Place of the tip, NaN where the solve failed, and the status."""
+    """Position of the tip, NaN where the solve failed, and the status."""
     outcome = model.solve(scene, inputs)
     sound = outcome.status == Status.CONVERGED
     tip = model.tip(scene, forces_where(sound, outcome.forces), outcome.state)[:3, 3]
@@ -241,8 +248,8 @@ def _tip_of(scene: Scene, inputs: Array, model: StrainDependent) -> tuple[Array,
 
 @eqx.filter_jit
 def _tip_errors(scene: Scene, samples: Array, steps: Array, room: int) -> tuple[Array, Array]:
-    """Distance [m] of the tip from that of the last number of steps, for each sample and each other
-    number; and the status of the last."""
+    """Distance [m] of the tip from the reference, the solve with the last number of steps, for each
+    sample and each other number; and the status of the reference."""
 
     def of(inputs: Array) -> tuple[Array, Array]:
         tips, status = jax.vmap(lambda wanted: _tip_of(scene, inputs, _Trial(room, wanted)))(steps)
@@ -253,8 +260,8 @@ def _tip_errors(scene: Scene, samples: Array, steps: Array, room: int) -> tuple[
 
 @eqx.filter_jit
 def _gradient_errors(scene: Scene, samples: Array, steps: Array, room: int) -> Array:
-    """Largest relative error of a derivative, for each sample and each number of steps but the
-    last, which is the reference."""
+    """Largest relative error of a derivative, for each sample and each number of steps except the
+    last, the reference."""
     numbers_, rest = eqx.partition(scene, eqx.is_inexact_array)
 
     def of(inputs: Array) -> Array:
@@ -273,8 +280,10 @@ def _gradient_errors(scene: Scene, samples: Array, steps: Array, room: int) -> A
 
 def gradient_error(slopes: Array, true: Array, values: Any) -> Array:
     r"""Largest relative error of the tip's derivatives, over the numbers p in `values` whose effect
-    $|p| |\partial x / \partial p|$ is a hundredth of the greatest or more; both of shape (3,
-    numbers)."""
+    $|p| |\partial x / \partial p|$ is at least 1 % of the largest.
+
+    **Arguments:** `slopes` and `true`, shape (3, numbers); `values`, a pytree of the numbers.
+    """
     size = jnp.concatenate([jnp.abs(leaf).reshape(-1) for leaf in jax.tree.leaves(values)])
     length = jnp.linalg.norm(true, axis=0)
     counts = (size * length > 0) & (size * length >= _NOTICED * jnp.max(size * length))

@@ -1,7 +1,6 @@
-"""Pictures of solved arms with matplotlib; every function draws into the axes it is given, or makes
-its own.
+"""Plots of solved arms with matplotlib; every function draws into given axes, or creates a figure.
 
-The package never imports this module by itself: `from vsr_jax import plot`.
+The package does not import this module on its own; use `from vsr_jax import plot`.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,7 +22,7 @@ from ..typing import VectorLike
 from ..validation import choice, on_arm
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Colours of Okabe and Ito, which stay apart for colour-blind readers."""
+"""The palette of Okabe and Ito, which colour-blind readers can distinguish."""
 
 LABELS: dict[str, str] = dict(
     zip(
@@ -43,8 +42,8 @@ def sample(
 ) -> Summary:
     """The summary of an equilibrium in NumPy arrays; `arm` and `strains` take it in place of `eq`.
 
-    **Arguments:** `stations`: how many, evenly spaced on the arm, or their abscissas [m];
-    `program`: what `sampling` compiled.
+    **Arguments:** `stations`: number of stations, evenly spaced on the arm, or their abscissas [m];
+    `program`: the result of `sampling`.
 
     **Raises:** `ValueError` for a batch of equilibria, for one that did not converge and for
     stations beyond the arm.
@@ -59,8 +58,8 @@ def sample(
 
 
 def sampling(eq: Equilibrium, stations: VectorLike = 60) -> Callable:
-    """The program of `sample`, compiled: for this equilibrium and for all of the same model and
-    kind of scene."""
+    """The compiled program of `sample`, for this equilibrium and all others with the same model and
+    scene structure."""
     return compiled_summary(eq, _abscissas(eq, stations))
 
 
@@ -82,14 +81,13 @@ def arm(
     threads: bool = True,
     **line: Any,
 ) -> Any:
-    """The deformed arm in space: its axis, its translucent outer wall and its threads, to equal
-    scale.
+    """The deformed arm in 3D: its axis, its translucent outer wall and its threads, at equal scale.
 
     **Arguments:**
-    - `eq`: an equilibrium, or what `sample` made of it.
+    - `eq`: an equilibrium, or the result of `sample`.
     - `ax`: 3D axes; a new figure by default.
-    - `color`, `label`, `linestyle`, `line`: properties of the axis curve, as matplotlib knows them.
-    - `stations`: how many stations, or their abscissas [m]; not used with a `Summary`.
+    - `color`, `label`, `linestyle`, `line`: matplotlib properties of the axis curve.
+    - `stations`: number of stations, or their abscissas [m]; not used with a `Summary`.
     - `surface`, `threads`: whether to draw the wall and the threads.
 
     **Returns:** the axes.
@@ -124,8 +122,8 @@ def arm(
 
 
 def equal_scale(ax: Any, *, zoom: float = 1.1) -> None:
-    """One scale for x, y and z: the box takes the proportions of what is drawn, no side thinner
-    than a third of the longest.
+    """Sets one scale for x, y and z: the box has the proportions of the data, with no side shorter
+    than about a third of the longest.
 
     **Arguments:** `ax`: 3D axes; `zoom`: size of the box in them.
     """
@@ -143,7 +141,7 @@ def equal_scale(ax: Any, *, zoom: float = 1.1) -> None:
         ticks = MaxNLocator(4 if width > 0.6 else 2, steps=[1, 2, 2.5, 4, 5, 10]).tick_values(
             start, end
         )
-        margin = 0.06 * (end - start)  # ticks at a corner would run into those of the next side
+        margin = 0.06 * (end - start)  # ticks at a corner would overlap those of the next side
         axis.set_ticks(ticks[(ticks > start + margin) & (ticks < end - margin)])
         ax.set(**{f"{name}lim": (start, end)})
     ax.set_box_aspect(span, zoom=zoom)
@@ -164,24 +162,24 @@ def strains(
     stations: VectorLike = 60,
     **line: Any,
 ) -> np.ndarray:
-    """The strains over X, one panel each; no panel spans less than 0.02, so that rounding does not
-    look like a signal.
+    """The strains over X, one panel per strain; no panel spans less than 0.02, so that rounding
+    does not look like a signal.
 
     **Arguments:**
-    - `eq`: an equilibrium, or what `sample` made of it.
-    - `ax`: one axes a name, in a row or a grid; a new figure by default, of 2 x 3 panels for all
+    - `eq`: an equilibrium, or the result of `sample`.
+    - `ax`: one axes per name, in a row or a grid; a new figure by default, of 2 x 3 panels for all
       six strains.
-    - `names`: which of `vsr_jax.rod.STRAINS`.
-    - `color`, `label`, `linestyle`, `line`: properties of the curves, as matplotlib knows them.
-    - `stations`: how many stations, or their abscissas [m]; not used with a `Summary`.
+    - `names`: names from `vsr_jax.arm.rod.STRAINS`.
+    - `color`, `label`, `linestyle`, `line`: matplotlib properties of the curves.
+    - `stations`: number of stations, or their abscissas [m]; not used with a `Summary`.
 
-    **Returns:** the axes, one a name.
+    **Returns:** the axes, one per name.
     """
     indices = [STRAINS.index(choice("names", name, STRAINS)) for name in names]
     samples = eq if isinstance(eq, Summary) else sample(eq, stations)
     axes = _panels(len(indices)) if ax is None else np.asarray(ax, dtype=object).reshape(-1)
     if len(axes) != len(indices):
-        raise ValueError(f"ax: got {len(axes)} axes, need {len(indices)}, one a name")
+        raise ValueError(f"ax: got {len(axes)} axes, need {len(indices)}, one per name")
     for panel, name, index in zip(axes, names, indices, strict=True):
         panel.plot(
             samples.X,
@@ -218,16 +216,16 @@ def workspace(
     color: Any = COLORS[0],
     most: int = 20_000,
 ) -> np.ndarray:
-    """Where the tip gets: a cloud of points in space, and seen along each axis.
+    """The workspace of the tip: its positions in 3D, and projected along each axis.
 
     **Arguments:**
     - `positions`: shape (samples, 3) [m]; rows with a NaN are left out.
     - `ax`: four axes, the first one 3D; a new figure by default.
-    - `values`, `label`: a number for each point that colours it, and what it is; all of one `color`
-      without.
-    - `most`: how many points are drawn; larger sets are subsampled evenly.
+    - `values`, `label`: one number per point that sets its colour, and the label of the colour bar;
+      without `values` all points have the colour `color`.
+    - `most`: maximum number of points drawn; larger sets are subsampled evenly.
 
-    **Returns:** the axes: in space, then y over x, z over x, z over y.
+    **Returns:** the axes: 3D, then y over x, z over x, z over y.
     """
     positions = np.asarray(positions)
     if positions.ndim != 2 or positions.shape[1] != 3:
@@ -259,5 +257,5 @@ def _corner() -> np.ndarray:
 
 
 def shade(color: Any) -> tuple[float, ...]:
-    """A darker tone of a colour, for what is drawn over it."""
+    """A darker shade of a colour, for lines drawn over it."""
     return tuple(0.55 * part for part in to_rgb(color))
