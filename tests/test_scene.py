@@ -210,7 +210,7 @@ def test_places_beyond_the_arm_are_refused(bent, quantity, X):
     [
         (0, 0.4, r"X: got 0\.4 m, need 0\.1 to 0\.3 m, the ends of thread 0"),
         (0, [0.2, 0.05], r"X: got 0\.05 m, need 0\.1 to 0\.3 m, the ends of thread 0"),
-        (1, 0.2, r"index: got 1, need the place of one of the scene's 1 actuators"),
+        (1, 0.2, r"index: got 1, need the index of one of the scene's 1 actuators"),
         (-1, 0.2, r"index: got -1, need"),
         (0.0, 0.2, r"index: got 0\.0, need"),
     ],

@@ -129,7 +129,7 @@ def test_a_grid_with_room_is_the_one_without(edges):
         ),
         (
             (HELICES, 1e-3, (-9e4, -8e4)),
-            "inputs_range: got no sample that has a stable equilibrium",
+            "inputs_range: got no sample with a stable equilibrium",
         ),
         ((None, 1e-3, RANGE), "scene: got None, need a Scene"),
     ],

@@ -366,7 +366,7 @@ def test_labels_of_coordinates_and_of_what_a_function_returns():
     for name in ("actuator", "sample", "a/b"):
         with pytest.raises(
             ValueError,
-            match=f"sweep.outputs: got '{name}', need for a store a name without / and none of a",
+            match=f"sweep.outputs: got '{name}', need a name without / and other than a",
         ):
             labelled(arm(0.006), inputs, lambda eq, name=name: {name: eq.tip})
 
