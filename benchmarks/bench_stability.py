@@ -24,7 +24,7 @@ from vsr_jax.mechanics.balance import residual
 from vsr_jax.mechanics.reaction import loading, react
 from vsr_jax.solution.equilibrium import Equilibrium
 from vsr_jax.solution.stability import extreme
-from vsr_jax.studies.timing import Timed, machine, take_turns
+from vsr_jax.studies.timing import Timed, machine, primitives, take_turns
 
 TENSIONS = [3.0, 1.0, 0.0, 0.5, 2.0, 0.0, 1.0, 0.5]
 
@@ -67,19 +67,6 @@ def dense(eq: Equilibrium, there: np.ndarray) -> jax.Array:
     return jnp.linalg.eigvalsh(0.5 * (scaled + scaled.T))[jnp.array([0, -1])]
 
 
-def count(jaxpr: Any) -> int:
-    """Number of equations of a program, including those of nested programs."""
-    inner = [
-        value
-        for eqn in jaxpr.eqns
-        for value in jax.tree.leaves(
-            list(eqn.params.values()), is_leaf=lambda x: hasattr(x, "eqns")
-        )
-    ]
-    inner = [getattr(value, "jaxpr", value) for value in inner]
-    return len(jaxpr.eqns) + sum(count(value) for value in inner if hasattr(value, "eqns"))
-
-
 def main() -> None:
     """Run the benchmark and print the table."""
     parser = argparse.ArgumentParser(
@@ -114,7 +101,7 @@ def main() -> None:
     }
     take_turns(jobs.values(), options.rounds)
     equations = {
-        name: count(jax.make_jaxpr(function)(*args).jaxpr)
+        name: primitives(jax.make_jaxpr(function)(*args).jaxpr).total()
         for name, (function, args, _) in programs.items()
     }
     rows = {name: job.summary() | {"equations": equations[name]} for name, job in jobs.items()}

@@ -2,15 +2,21 @@
 and the paper's helix.
 
 Nearly all of the suite's time is XLA's compiler, and each program runs only a few times on little
-data: so it is told not to optimise, which makes it two to three times faster. Set XLA_FLAGS
-yourself (to nothing, say) to test what users run.
+data: so it runs without its optimisations and without threads of its own beside the two test
+processes, which is two to three times faster. Set XLA_FLAGS yourself (to nothing, say) to test what
+users run.
 """
 
+import gc
 import os
 
 os.environ.setdefault(
-    "XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
+    "XLA_FLAGS",
+    "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 "
+    "--xla_cpu_parallel_codegen_split_count=1",
 )
+
+os.environ.setdefault("VSR_JAX_CACHE", "off")  # commands run here leave nothing behind
 
 import jaxtyping
 
@@ -24,7 +30,16 @@ import pytest
 
 jax.config.update("jax_enable_x64", True)
 
+# Traced programs are millions of small objects that stay: looking for garbage among them at
+# Python's usual pace takes a tenth of the time, and more the longer a process runs.
+gc.freeze()
+gc.set_threshold(200_000, 50, 1000)
+
+from vsr_jax.cli import compiling  # noqa: E402
 from vsr_jax.studies import paper  # noqa: E402
+
+# On a slow machine commands would say that they compile wherever a test reads what they print.
+compiling.SILENT = 1e6
 
 
 def epsilon(dtype) -> float:

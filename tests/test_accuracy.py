@@ -42,6 +42,7 @@ def test_strain_is_exact_to_rounding(rows):
     assert rows[0].strain < 1e-13
 
 
+@pytest.mark.slow
 def test_gradient_error_against_central_differences_at_ten_times_the_steps(rows):
     scene, inputs = paper.scene("B1"), INPUTS[0]
     numbers, rest = eqx.partition((scene, inputs), eqx.is_inexact_array)
@@ -123,3 +124,19 @@ def test_the_command(tmp_path, capsys, monkeypatch, rows):
     assert "for 1 mm use steps of order 6, 8" in capsys.readouterr().out
     assert json.loads(out.read_text())["B2, two helices"][0]["lost"] == 0
     assert (tmp_path / "a.png").stat().st_size > 10_000
+
+
+def test_the_command_reads_a_scene_file(tmp_path, capsys, monkeypatch, rows):
+    def measure(scene, inputs, settings, report):
+        assert [type(actuator) for actuator in scene.actuators] == [vsr.Tendon]
+        assert np.all((inputs > 0.1 * 2.5) & (inputs < 2.5))
+        return rows
+
+    monkeypatch.setattr(accuracy, "measure", measure)
+    path, out = tmp_path / "arm.toml", tmp_path / "rows.json"
+    rod = vsr.Rod(0.3, vsr.Circular(0.01), vsr.Material(1e6, poisson=0.45))
+    vsr.save(vsr.Scene(rod, [vsr.Tendon(vsr.Parallel(0.0, 0.008))]), path, [2.5], "An arm")
+    arguments = ["accuracy", str(path), "--batch-size", "3", "--groups", "steps"]
+    assert cli.main([*arguments, "--json", str(out)]) == cli_common.DONE
+    assert "for 1 mm use steps of order 6, 8" in capsys.readouterr().out
+    assert list(json.loads(out.read_text())) == ["An arm"]

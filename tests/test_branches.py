@@ -138,6 +138,28 @@ def test_tensions_and_lengths_along_a_path():
     np.testing.assert_allclose(forces[-1], end.forces, rtol=1e-8)
 
 
+def test_a_curve_that_returns_ends_at_the_start_of_the_path():
+    """From 0.45 the column leans to its limit point and back through the upright position."""
+    branch = vsr.follow_branch(lambda s: column(0.45 + 0.55 * s), no_inputs, model=MODEL, points=60)
+    s = np.asarray(branch.parameter)
+    assert np.all(branch.equilibria.converged)
+    assert s[0] == s[-1] == 0
+    assert np.min(s) == 0
+    assert 0.05 < np.max(s) < 0.5
+    tips = np.asarray(jax.vmap(lambda eq: eq.tip[:3, 3])(branch.equilibria))
+    assert np.linalg.norm(tips[0] - tips[-1]) > 0.1  # another equilibrium of the same scene
+
+
+def test_points_with_inadmissible_inputs_have_that_status():
+    rod = vsr.Rod(0.3, vsr.Circular(0.01), vsr.Material(1e6, poisson=0.45))
+    scene = vsr.Scene(rod, [vsr.Tendon(vsr.Parallel(0.0, 0.008))], free_strains=PLANE)
+    branch = vsr.follow_branch(scene, lambda s: jnp.array([2.0 - 4.0 * s]), model=MODEL, points=40)
+    s, status = np.asarray(branch.parameter), np.asarray(branch.equilibria.status)
+    assert s[-1] == 1
+    assert np.array_equal(status == vsr.Status.INADMISSIBLE, s > 0.5)
+    assert np.array_equal(status == vsr.Status.CONVERGED, s <= 0.5)
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

@@ -209,10 +209,8 @@ EFFECTS = {
 }
 
 
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=pytest.mark.slow if name == "all" else []) for name in EFFECTS],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", EFFECTS)
 def test_gradients_through_effects(name):
     """Reverse mode = central differences, by every number of the scene and by the inputs."""
     loads, options = EFFECTS[name]
@@ -265,6 +263,7 @@ def test_forward_mode_is_reverse_mode():
     )
 
 
+@pytest.mark.slow
 def test_vmap_over_lengths(pulled):
     _, changes = pulled
     driven, batch = (

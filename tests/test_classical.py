@@ -492,8 +492,8 @@ class TestBend:
     polar moment 1/6 (GJ = EI) and Saint-Venant's 0.1406, which move the tip by 0.40, 0.36 and 0.32.
     Bathe & Bolourchi (0.85 and 0.23 away) and Simo & Vu-Quoc (0.18 at most) are nearer to the
     first; Crisfield (0.13 at most), Ibrahimbegovic (0.006) and Longva (0.10 at most) to the second;
-    Cardona & Geradin lie between (0.24 and 0.18 at most). Which constant an author took is told
-    here by these distances alone.
+    Cardona & Geradin lie between (0.24 and 0.18 at most). Which constant an author took is
+    inferred here from these distances alone.
     """
 
     def test_tip_is_that_of_an_independent_shooting_method(self, bends):

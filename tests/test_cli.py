@@ -6,6 +6,7 @@ import io
 import json
 import pathlib
 import re
+import subprocess
 import sys
 from typing import NamedTuple
 
@@ -175,6 +176,7 @@ def test_help_shows_a_scene_file_that_loads(capsys):
     assert len(parse_scene(scene).scene.actuators) == 2
 
 
+@pytest.mark.slow
 def test_paper_writes_table_and_figures(tmp_path, capsys):
     assert cli.main(["paper", "--cases", "A1", "--out", str(tmp_path)]) == 0
     rows = json.loads((tmp_path / "table.json").read_text())["rows"]
@@ -239,6 +241,15 @@ def test_sweep_keeps_and_draws_a_workspace(tmp_path, capsys):
     assert said.endswith(": status[0:50]")
 
 
+def test_matplotlib_is_imported_only_to_draw():
+    code = (
+        "import sys; from vsr_jax.cli import main; "
+        f"main.main(['solve', {HELIX!r}, '--steps', '4']); print('matplotlib' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "False"
+
+
 def test_a_sweep_to_disk_without_zarr_is_one_line(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "zarr", None)
     assert (
@@ -259,6 +270,16 @@ def test_a_sweep_without_a_solution_exits_with_1(capsys):
         == cli_common.NOT_CONVERGED
     )
     assert "samples     3 collapsed\n" in capsys.readouterr().out
+
+
+def test_the_default_bounds_of_negative_forces_end_at_zero(capsys):
+    arguments = ["sweep", HELIX, "--samples", "3", "--steps", "8"]
+    assert cli.main(arguments) == cli_common.DONE
+    assert "inputs      -5 to 0\nsamples     3 converged\n" in capsys.readouterr().out
+    low, high = cli_common.bounds(None, None, np.array([-2.0, 0.0, 3.0]))
+    assert (low.tolist(), high.tolist()) == ([-2.0, 0.0, 0.0], [0.0, 0.0, 3.0])
+    low, high = cli_common.bounds([-1.0], None, np.array([-2.0, 3.0]))
+    assert (low.tolist(), high.tolist()) == ([-1.0, -1.0], [0.0, 3.0])
 
 
 def test_bounds_of_a_sweep_are_in_order(capsys):

@@ -98,7 +98,10 @@ def test_a_thread_leaves_the_axis():
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(name, marks=[pytest.mark.slow] * (name == "compliance")) for name in OBJECTIVES],
+    [
+        pytest.param(name, marks=[pytest.mark.slow] * (name in ("compliance", "several")))
+        for name in OBJECTIVES
+    ],
 )
 def test_gradients_of_objectives_against_differences(scene, tips, name):
     """With respect to radius, angle and all inputs."""
@@ -337,6 +340,7 @@ def test_starts_without_equilibrium_are_recorded_as_nan(scene):
         ({"inputs": [1.0, 2.0]}, r"inputs: got shape \(2,\), need \(sets, 2\)"),
         ({"constraints": [3]}, r"constraints\[0\]: got 3, need a Constraint"),
         ({"uncertain": {"rod.length": -1.0}}, "need a finite number > 0"),
+        ({"uncertain": {"inputs": 0.1}}, "uncertain: got 'inputs', need numbers of the scene"),
         ({"search": 3}, "search: got 3, need a Search"),
         ({"out": "nowhere/at/all"}, "need a file in an existing folder"),
     ],

@@ -1,4 +1,4 @@
-"""Cost of each effect: the ladder of scenes, and timing."""
+"""Cost of each effect: the scenes compared, and timing."""
 
 import itertools
 
@@ -12,11 +12,11 @@ from vsr_jax.studies import effects
 from vsr_jax.studies.timing import Timed, take_turns
 
 
-def test_every_rung_adds_one_effect():
-    rungs = effects.ladder()
+def test_every_scene_adds_one_effect():
+    scenes = effects.scenes()
     added = [
         [name for name in b.scene.effects if name not in a.scene.effects]
-        for a, b in itertools.pairwise(rungs)
+        for a, b in itertools.pairwise(scenes)
     ]
     # a wrench between base and tip breaks the steps too: the second section adds no new effect, but
     # a break of its own
@@ -29,8 +29,8 @@ def test_every_rung_adds_one_effect():
         ["length control"],
         ["friction"],
     ]
-    assert [len(rung.scene.breakpoints) for rung in rungs[4:6]] == [1, 3]
-    assert [rung.pose for rung in rungs] == [False] + [True] * 7
+    assert [len(one.scene.breakpoints) for one in scenes[4:6]] == [1, 3]
+    assert [one.pose for one in scenes] == [False] + [True] * 7
 
 
 def test_timed_measures_operations_and_times():
@@ -70,7 +70,7 @@ def test_command_rejects_an_empty_batch(capsys):
 
 
 @pytest.mark.slow
-def test_all_rungs_are_measured():
+def test_all_scenes_are_measured():
     costs = effects.measure(batch_size=4, rounds=1, model=vsr.StrainDependent(4))
     assert all(cost.converged == 1 for cost in costs)
     operations = [cost.operations for cost in costs]

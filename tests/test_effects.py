@@ -1,12 +1,11 @@
 """What a scene does not call for leaves no trace in the program."""
 
-from collections import Counter
-
 import jax
 import jax.numpy as jnp
 import pytest
 
 import vsr_jax as vsr
+from vsr_jax.studies.timing import primitives
 
 ARM = vsr.Rod(0.3, vsr.Circular(0.01), vsr.Material(1e6, poisson=0.45, density=1000.0))
 PATH = vsr.Parallel(0.007, 0.0)
@@ -15,21 +14,9 @@ STEPS = vsr.StrainDependent(8)
 
 def operations(scene):
     """How often each primitive occurs in the solve of a scene, nested programs included."""
-    counts = Counter()
-
-    def walk(jaxpr):
-        for equation in jaxpr.eqns:
-            counts[equation.primitive.name] += 1
-            for value in jax.tree.leaves(
-                list(equation.params.values()),
-                is_leaf=lambda x: hasattr(x, "jaxpr") or hasattr(x, "eqns"),
-            ):
-                if hasattr(value, "jaxpr") or hasattr(value, "eqns"):
-                    walk(getattr(value, "jaxpr", value))
-
     values = jnp.zeros(len(scene.actuators))
-    walk(jax.make_jaxpr(lambda inputs: STEPS.solve(scene, inputs).state.xi)(values).jaxpr)
-    return counts
+    program = jax.make_jaxpr(lambda inputs: STEPS.solve(scene, inputs).state.xi)(values)
+    return primitives(program.jaxpr)
 
 
 @pytest.fixture(scope="module")

@@ -107,7 +107,7 @@ def loaded(**of_the_tendon):
 @pytest.mark.parametrize(
     ("tendon", "value"),
     [
-        ({}, 8.0),
+        pytest.param({}, 8.0, marks=pytest.mark.slow),
         pytest.param({"control": "length"}, -0.01, marks=pytest.mark.slow),
         pytest.param({"friction": 0.1}, 8.0, marks=pytest.mark.slow),
     ],

@@ -59,6 +59,7 @@ def test_reverse_mode_under_friction_is_the_difference(deflection):
     )
 
 
+@pytest.mark.slow
 def test_modulus_batched_alone_under_friction(deflection):
     """`jax.vmap` over one number of the scene; the shape depends on the tensions by the modulus
     alone."""

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import vsr_jax as vsr
-from vsr_jax.cli import main as cli, report
+from vsr_jax.analysis.health import Limit, _independence
+from vsr_jax.cli import main as cli
 from vsr_jax.studies import paper
 
 LENGTH, RADIUS = 0.3, 0.01
@@ -58,7 +59,7 @@ def test_the_papers_arm_collapses_at_93_newtons():
 
 def test_twin_threads_are_not_independent(twins):
     assert abs(twins.independence) < 1e-14
-    assert "some threads are redundant" in " ".join(report.health_lines(twins))
+    assert "some threads are redundant" in str(twins)
     apart = vsr.Scene(
         rod(), [vsr.Tendon(vsr.Parallel(0.0, 0.008)), vsr.Tendon(vsr.Parallel(0.008, 0.0))]
     )
@@ -67,7 +68,7 @@ def test_twin_threads_are_not_independent(twins):
         1 / AXIAL + 0.008**2 / BENDING
     )  # of the two, through the elongation alone
     np.testing.assert_allclose(health.independence, 1 - coupling, rtol=1e-9)
-    assert report.health_lines(health)[-1] == "  advice       no problems found"
+    assert str(health).splitlines()[-1] == "  advice       no problems found"
 
 
 def test_a_strut_fails_at_eulers_load(strut):
@@ -84,6 +85,43 @@ def test_no_finer_steps_are_needed_for_an_arc(twins):
     assert twins.equilibrium.converged
 
 
+def test_an_unknown_condition_has_no_digits(twins, monkeypatch):
+    monkeypatch.setattr(vsr.Health, "_margins", lambda self: (math.nan, math.nan))
+    assert "  condition    unknown" in str(twins).splitlines()
+    assert twins.record()["condition"] is None
+
+
+def test_a_factor_of_one_within_its_resolution_is_close_to_failure(twins):
+    edge = Limit(jnp.array(0.9999), jnp.array(vsr.Status.UNSTABLE))
+    assert twins._replace(inputs=edge).advice[0] == (
+        "close to failure: inputs may grow by 0 % at most"
+    )
+    below = Limit(jnp.array(0.99), jnp.array(vsr.Status.UNSTABLE))  # fails between 0.99 and 1
+    assert "close to failure" not in twins._replace(inputs=below).advice[0]
+
+
+def test_redundant_threads_are_found_in_both_precisions(dtype):
+    around = [(math.cos(i * math.pi / 3), math.sin(i * math.pi / 3)) for i in range(6)]
+    threads = [vsr.Tendon(vsr.Parallel(0.005 * y, 0.005 * z)) for y, z in around]
+    eq = vsr.solve(vsr.Scene(rod(), threads), jnp.ones(6, dtype), model=MODEL)
+    limit = Limit(jnp.array(2.0), jnp.array(vsr.Status.COLLAPSED))
+    health = vsr.Health(eq, _independence(eq.scene), limit, None, jnp.zeros((), dtype))
+    assert health.independence.dtype == dtype
+    assert "some threads are redundant" in health.advice[-1]
+
+
+def test_a_thread_without_effect_is_not_independent():
+    threads = [vsr.Tendon(vsr.Parallel(0.0, z)) for z in (0.0, 0.008)]
+    bending = vsr.Scene(rod(), threads, free_strains=["bending_y", "bending_z"])
+    assert _independence(bending) == 0
+
+
+def test_a_rod_without_inputs_and_loads_has_no_limits():
+    health = vsr.check(vsr.Scene(rod()), jnp.zeros(0), model=MODEL)
+    assert health.inputs is health.loads is health.independence is None
+    assert health.advice == ("no problems found",)
+
+
 def test_it_runs_under_jit(twins):
     again = eqx.filter_jit(lambda scene, inputs: vsr.check(scene, inputs, model=MODEL))(
         twins.equilibrium.scene, twins.equilibrium.inputs
@@ -94,11 +132,10 @@ def test_it_runs_under_jit(twins):
 def test_a_failed_solve_gets_a_remedy():
     helix = vsr.Scene(rod(), [vsr.Tendon(vsr.Helix(0.005, pitch=LENGTH / 50))])
     health = vsr.check(helix, jnp.array([20.0]), model=vsr.StrainDependent(8))
-    text = report.health_lines(health, "Fifty turns")
-    assert text[0] == "Fifty turns"
-    assert "under-resolved" in text[1]
+    text = str(health).splitlines()
+    assert "under-resolved" in text[0]
     assert "take more steps: StrainDependent(steps=16, order=6)" in text[-1]
-    record = report.health_record(health)
+    record = health.record()
     assert (record["margin"], record["tip_change"], record["converged"]) == (None, None, False)
     assert 0 < record["inputs"]["factor"] < 1
 

@@ -9,7 +9,7 @@ import pytest
 import vsr_jax as vsr
 from vsr_jax.analysis import plausible
 from vsr_jax.analysis.health import Limit
-from vsr_jax.cli import common as cli_common, main as cli, report
+from vsr_jax.cli import common as cli_common, main as cli
 from vsr_jax.files.scene_file import load
 from vsr_jax.optimization import design_search
 from vsr_jax.studies import paper
@@ -35,7 +35,10 @@ def arm(
 @pytest.mark.parametrize(
     ("numbers", "sentence"),
     [
-        ({"length": 400.0}, "rod.length: 400 m; arms are 1 mm to 20 m long; is it in millimetres?"),
+        (
+            {"length": 400.0},
+            "rod.length: 400 m; arms are 1 mm to 20 m long; is it in millimetres?",
+        ),
         ({"length": 1e9}, "rod.length: 1e+09 m; arms are 1 mm to 20 m long"),
         (
             {"length": 200.0, "radius": 0.5},
@@ -43,11 +46,11 @@ def arm(
         ),
         (
             {"radius": 7.0},
-            "rod.section: half thickness: 7 m; arms have 5 um to 0.5 m; is it in millimetres?",
+            "rod.section: half thickness: 7 m; arms have 5 um to 500 mm; is it in millimetres?",
         ),
         (
             {"guide_radius": 10.0},
-            "rod.guide_radius: 10 m; arms have 5 um to 0.5 m; is it in millimetres?",
+            "rod.guide_radius: 10 m; arms have 5 um to 500 mm; is it in millimetres?",
         ),
         (
             {"radius": 0.2},
@@ -130,8 +133,8 @@ def test_the_health_of_a_solve_has_the_warnings(helix):
     limit = Limit(jnp.array(2.0), jnp.array(0))
     health = vsr.Health(eq, None, limit, None, jnp.array(0.0))
     (sentence,) = health.warnings
-    assert f"  warning      {sentence}" in report.health_lines(health)
-    assert report.health_record(health)["warnings"] == [sentence]
+    assert f"  warning      {sentence}" in str(health).splitlines()
+    assert health.record()["warnings"] == [sentence]
 
 
 @pytest.mark.parametrize(

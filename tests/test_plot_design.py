@@ -2,15 +2,18 @@
 them."""
 
 import json
+import tomllib
 
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+import tomli_w
 
 import vsr_jax as vsr
 from vsr_jax.cli import design_commands as cli_design, main as cli
 from vsr_jax.files.scene_file import load
+from vsr_jax.optimization.descent import History
 from vsr_jax.optimization.design_file import load_design
 from vsr_jax.viz import annotate, plot, plot_design
 from vsr_jax.viz.animation import film
@@ -83,6 +86,7 @@ def arrows(ax):
     return [len(bundle._segments3d) for bundle in ax.collections if hasattr(bundle, "_segments3d")]
 
 
+@pytest.mark.slow
 def test_frames_and_loads_are_drawn_onto_an_arm(eq):
     ax = annotate.frames(eq, plot.arm(eq), stations=5)
     assert arrows(ax) == [15, 15, 15]  # one shaft and two lines of the head per arrow
@@ -90,9 +94,21 @@ def test_frames_and_loads_are_drawn_onto_an_arm(eq):
     assert len(loaded.collections) == 2  # twelve arrows of the weight, one at the tip
     assert loaded.zz_dataLim.x0 < -0.26  # the limits include all arrow heads
     assert loaded.zz_dataLim.x1 > -0.001
-    weight, tip = annotate._forces(eq, 0.3)
+    (weight,), (tip,) = annotate._densities(eq, 0.3), annotate._point_forces(eq)
     np.testing.assert_allclose(weight[1], [[0, 0, -9.81 * 1000 * np.pi * 1e-4]] * 12, rtol=1e-6)
     np.testing.assert_allclose(tip[1][0], 0.02 * np.asarray(eq.tip)[:3, 2], rtol=1e-6)
+
+
+def test_arrows_of_point_forces_have_one_scale(eq):
+    loads = [
+        vsr.PointWrench(0.1, force=(0.0, 0.0, 0.02)),
+        vsr.PointWrench(0.2, force=(0.0, 0.01, 0.0), frame="body"),
+    ]
+    arm = vsr.solve(vsr.Scene(eq.scene.rod, eq.scene.actuators, loads), [1.0], model=MODEL)
+    ax = annotate.loads(arm)
+    dead, follower = (np.asarray(bundle._segments3d)[0] for bundle in ax.collections)
+    for shaft, share in ((dead, 0.16), (follower, 0.08)):
+        np.testing.assert_allclose(np.linalg.norm(shaft[1] - shaft[0]), share * 0.3, rtol=1e-6)
 
 
 def test_an_ellipsoid_has_its_semi_axes():
@@ -139,9 +155,20 @@ def test_a_history_marks_the_best_start(problem):
     arguments = load_design(problem)._asdict()
     del arguments["title"]
     found = vsr.design(**arguments, progress=False)
+    best = found.starts[found.best]
+    assert (best.objective, best.violation) == (found.objective, 0)
     lines = plot_design.history(found).get_lines()
     assert [line.get_label() for line in lines][-1] == "best start"
     assert np.nanmin(lines[-1].get_ydata()) == pytest.approx(found.objective)
+
+
+def test_a_design_of_a_scene_without_equilibrium_is_drawn_alone(eq):
+    none = History(np.zeros((0, 1)), np.zeros((0, 1)))
+    found = vsr.Design(eq.scene, eq.inputs[None], 0.0, True, {}, (), (), 0, none)
+    space = plot_design.before_after(eq.scene, found, jnp.array([1e6]), model=MODEL)
+    assert [text.get_text() for text in space.get_legend().get_texts()] == ["after"]
+    space = plot_design.before_after(eq.scene, found, jnp.array([2.0]), model=MODEL)
+    assert [text.get_text() for text in space.get_legend().get_texts()] == ["before", "after"]
 
 
 @pytest.mark.parametrize(
@@ -160,11 +187,28 @@ def test_a_history_marks_the_best_start(problem):
         ("steps = 4", "step = 4", r"search: unknown key 'step'.*did you mean 'steps'"),
         ("steps = 4", "steps = 0", r"search: Search.steps: got 0, need an integer >= 1"),
         ("steps = 4", "optimizer = 1", r"search: got .*, need a table of numbers"),
+        ("inputs = [[2.0]]", "inputs = [[2.0]]\nuncertain = 3", "uncertain: got 3, need a table"),
+        ('"TipError"\n', f'"TipError"\nweight = {10**400}\n', "factor: got 1000.*, need a finite"),
+        ("= 5.0", f"= {10**400}", r"objectives\[1\]: Tension.scale: got 1000.*, need a finite"),
     ],
 )
 def test_errors_of_design_files_name_file_and_key(unchecked, problem, old, new, message):
     problem.write_text(PROBLEM.replace(old, new, 1))
     with pytest.raises(ValueError, match=rf"problem.toml: .*{message}"):
+        load_design(problem)
+
+
+@pytest.mark.parametrize(
+    ("key", "message"),
+    [
+        ("scene", r"scene: got 3, need a file or a table \[scene\]"),
+        ("free", r"free: got 3, need a table \[free\] of bounds"),
+    ],
+)
+def test_a_number_in_place_of_a_table_is_one_line(unchecked, problem, key, message):
+    table = tomllib.loads(PROBLEM) | {key: 3}
+    problem.write_text(tomli_w.dumps(table))
+    with pytest.raises(ValueError, match=rf"problem.toml: {message}"):
         load_design(problem)
 
 

@@ -161,6 +161,7 @@ def test_eq_20_gives_q_equal_tau(case):
     assert np.linalg.eigvalsh(K).min() > 0
 
 
+@pytest.mark.slow
 def test_legendre_bases_converge_geometrically(capsys):
     """Tip error on B1 by order, 0 to 10: from order 4 on, every two orders gain at least a factor
     of four."""
@@ -240,3 +241,32 @@ def test_actuation_matrix_knows_where_a_thread_ends():
     eq = vsr.solve(scene, jnp.array([-0.01]), model=vsr.Prescribed(basis))
     K, B = vsr.stiffness_matrix(scene, basis), vsr.actuation_matrix(scene, basis, eq.q)
     np.testing.assert_allclose(K @ eq.q, B @ eq.forces, atol=1e-14)
+
+
+def test_a_family_that_several_strains_share_breaks_the_steps_once():
+    basis = vsr.Basis.uniform(vsr.PiecewiseConstant(4))
+    copy = jax.tree.map(lambda leaf: leaf, basis)  # as every solve makes one
+    assert len(basis.breakpoints(jnp.array(1.0))) == len(copy.breakpoints(jnp.array(1.0))) == 3
+
+
+def test_a_basis_of_functions_has_the_shape_that_was_promised():
+    arm = vsr.Rod(0.3, vsr.Circular(0.01), vsr.Material(1e6, poisson=0.4))
+    scene = vsr.Scene(arm, [vsr.Tendon(vsr.Parallel(0.005, 0.0))])
+    lists = vsr.Basis({"bending_z": vsr.Functions(lambda X: [1.0, X], size=2)})
+    line = vsr.Basis({"bending_z": vsr.Monomial(1)})
+    tips = [vsr.solve(scene, [1.0], model=vsr.Prescribed(basis)).tip for basis in (lists, line)]
+    np.testing.assert_allclose(*tips, atol=1e-12)
+    short = vsr.Basis({"bending_z": vsr.Functions(lambda X: [1.0], size=2)})
+    with pytest.raises(ValueError, match=r"Functions\.function: got values of shape \(1,\)"):
+        vsr.solve(scene, [1.0], model=vsr.Prescribed(short))
+
+
+def test_the_actuation_matrix_of_an_arm_without_actuators_has_no_columns():
+    arm = vsr.Rod(0.3, vsr.Circular(0.01), vsr.Material(1e6, poisson=0.4))
+    basis = vsr.Basis.uniform(vsr.PiecewiseConstant(np.int64(2)))
+    assert vsr.actuation_matrix(vsr.Scene(arm), basis, jnp.zeros(12)).shape == (12, 0)
+
+
+def test_finer_is_finer_in_its_quadrature_too():
+    finer = vsr.Prescribed(vsr.Basis.uniform(vsr.Legendre(2)), points=8, steps=16).finer()
+    assert (finer.points, finer.steps) == (16, 32)

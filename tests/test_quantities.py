@@ -1,5 +1,8 @@
 """The table of quantities, the energy, and everything along an arm from one program."""
 
+import copy
+import pickle
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +11,8 @@ from conftest import central_differences
 
 import vsr_jax as vsr
 from vsr_jax.solution import QUANTITIES, quantity
+from vsr_jax.solution.quantities import along_arm
+from vsr_jax.solution.summary import values_of
 
 LENGTH = 0.3
 MODEL = vsr.StrainDependent(16)
@@ -44,6 +49,7 @@ def loaded(numbers):
     return eq.energy.total, (eq.status, eq.summary(X, VALUES))
 
 
+@pytest.mark.slow
 def test_the_energy_is_stationary():
     r"""By the envelope theorem $d\Pi / d\tau_i = -l_i$, $d\Pi / dT = l$, $d\Pi / dF = -r(L)$; by
     the weight the moment of the arm's mass; by a given length the tension, less what is stored in
@@ -87,6 +93,26 @@ def test_a_summary_is_what_the_attributes_are(solved):
     np.testing.assert_allclose(found.curvature, np.hypot(*np.asarray(found.strain)[:, 1:3].T))
 
 
+def test_a_summary_can_be_copied_and_pickled(solved):
+    found = jax.tree.map(np.asarray, solved.summary(3, ("tip",)))
+    for again in (copy.deepcopy(found), pickle.loads(pickle.dumps(found))):
+        np.testing.assert_array_equal(again.strain, found.strain)
+        np.testing.assert_array_equal(again.tip, found.tip)
+    with pytest.raises(AttributeError, match="it has curvature, pose, position"):
+        found.lengths  # noqa: B018
+
+
+def test_values_are_those_of_a_summary_without_its_program(solved, monkeypatch):
+    expected = solved.summary(2, ("tip", "condition")).values
+    monkeypatch.setattr(type(solved), "summary", None)
+    found = values_of(solved, ("tip", "condition"))
+    for name, value in expected.items():
+        np.testing.assert_allclose(found[name], value, rtol=1e-10, atol=1e-15)
+    assert "stability margin" in str(solved)
+    with pytest.raises(ValueError, match="values: got 'strain', need one of 'tip'"):
+        values_of(solved, ("strain",))
+
+
 def test_every_entry_says_what_it_is():
     for name, entry in QUANTITIES.items():
         assert entry.name == name
@@ -113,6 +139,13 @@ def test_a_new_quantity_is_one_entry(solved):
         QUANTITIES.pop("height", None)
     with pytest.raises(ValueError, match="name: got 'height', need one of tip, pose"):
         eq.value("height")
+
+
+def test_a_quantity_of_another_names_one_along_the_arm():
+    for name in ("strian", "tip"):
+        with pytest.raises(ValueError, match=f"of: got '{name}', need one of 'pose', 'position'"):
+            along_arm("1", of=name)(lambda eq, value: value)
+    assert "<lambda>" not in QUANTITIES
 
 
 def test_a_failed_solve_has_no_energy(solved):

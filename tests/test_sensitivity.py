@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import vsr_jax as vsr
+from vsr_jax.analysis.derivatives import ellipsoid
 from vsr_jax.arm.scene_numbers import replaced
 from vsr_jax.models.base import SteppedModel
 
@@ -199,6 +200,18 @@ def test_ellipsoids(eq):
     )
 
 
+@pytest.mark.parametrize("columns", [1, 2, 3, 5])
+def test_an_ellipsoid_of_any_number_of_inputs_has_derivatives(columns):
+    A, centre = np.random.default_rng(0).normal(size=(3, columns)), jnp.zeros(3)
+    found = ellipsoid(jnp.asarray(A), centre)
+    np.testing.assert_allclose(found.axes @ found.axes.T, A @ A.T, atol=1e-14)
+    slope = jax.grad(lambda A: ellipsoid(A, centre).measure)(jnp.asarray(A))
+    volume = np.sqrt(max(np.linalg.det(A @ A.T), 0.0))
+    expected = volume * np.linalg.pinv(A).T if columns >= 3 else np.zeros_like(A)
+    np.testing.assert_allclose(slope, expected, atol=1e-13)
+
+
+@pytest.mark.slow
 def test_under_vmap_jit_and_grad_and_in_single_precision(eq):
     scene = eq.scene.astype(jnp.float32)
 

@@ -125,7 +125,18 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name",
+    [
+        "cables, one of them slack",
+        "followers",
+        "dead moment, locked strains",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("threads that end at one place", "hanging from its end", "dead loads")
+        ),
+    ],
+)
 def test_the_ends_of_the_spectrum_are_those_of_the_dense_tangent(name):
     scene, forces = CASES[name]
     forces, nodes = tuple(jnp.asarray(f) for f in forces), bent(scene)
@@ -166,6 +177,7 @@ def slopes():
     return jax.jit(jax.vmap(jax.value_and_grad(margin)))
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_differences(slopes):
     steps = np.concatenate([np.zeros((1, 3)), *(h * np.eye(3) for h in (1e-3, -1e-3, 2e-3, -2e-3))])
     value, slope = (np.asarray(x) for x in slopes(jnp.asarray(POINT + steps)))
@@ -177,6 +189,7 @@ def test_derivatives_are_those_of_differences(slopes):
     )
 
 
+@pytest.mark.slow
 def test_second_derivatives_are_those_of_differences(slopes):
     direction = np.array([0.3, -0.5, 0.7])
     slope = np.asarray(
@@ -200,6 +213,7 @@ def test_side_by_side_each_is_what_it_is_alone(slopes):
     assert np.all(np.isfinite(slope[np.array([0, 1, *range(3, 13)])]))
 
 
+@pytest.mark.slow
 def test_in_single_precision(slopes):
     p = jnp.asarray(np.concatenate([[POINT], np.ones((12, 3))]))
     value, slope = slopes(p)
@@ -271,6 +285,7 @@ def test_what_is_not_found_is_not_given(monkeypatch):
     assert np.all(np.isnan(extreme_pairs(Diagonal(jnp.linspace(0.0, 1.0, 64))).values))
 
 
+@pytest.mark.slow
 def test_derivatives_of_both_ends_of_any_order():
     random = np.random.default_rng(3)
     A, B, C = (x + x.T for x in random.standard_normal((3, 12, 12)))

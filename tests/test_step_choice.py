@@ -87,6 +87,7 @@ def test_under_loads():
     )
 
 
+@pytest.mark.slow
 def test_a_helix_of_fifty_turns_gets_steps_enough():
     arm = vsr.Rod(0.75, vsr.Circular(0.01), vsr.Material(5.93e5, shear=2e5))
     scene = vsr.Scene(arm, [vsr.Tendon(vsr.Helix(0.005, pitch=0.75 / 50))])
@@ -140,7 +141,7 @@ def test_refusals(unchecked, arguments, message):
 
 
 def test_a_tolerance_beyond_the_precision_is_refused(monkeypatch):
-    monkeypatch.setattr(sys.modules["vsr_jax.solution.step_choice"], "_ROOMS", (64,))
+    monkeypatch.setattr(sys.modules["vsr_jax.solution.step_choice"], "_CAPACITIES", (64,))
     with pytest.raises(ValueError, match="tolerance: got 1e-16 m, need at least"):
         vsr.plan(HELICES, 1e-16, RANGE)
 

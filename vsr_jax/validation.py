@@ -2,6 +2,7 @@
 what is needed."""
 
 from collections.abc import Sequence
+from types import UnionType
 from typing import Any
 
 import jax.numpy as jnp
@@ -62,7 +63,7 @@ def numbers(
         raise _error(name, value, needed)
     try:
         array = jnp.asarray(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):  # an integer beyond 64 bits overflows
         raise _error(name, value, needed) from None
     if jnp.issubdtype(array.dtype, jnp.complexfloating) or array.dtype == bool:
         raise _error(name, value, needed)
@@ -166,9 +167,13 @@ def positive(name: str, value: Any) -> float:
         or is_traced(value)
     ):
         raise _error(name, value, "a finite number > 0")
-    if np.ndim(value) or not (np.isfinite(value) and value > 0):
+    try:
+        number = np.nan if np.ndim(value) else float(value)
+    except OverflowError:
+        number = np.inf
+    if not (np.isfinite(number) and number > 0):
         raise _error(name, value, "a finite number > 0")
-    return float(value)
+    return number
 
 
 def count(name: str, value: Any, *, least: int = 1) -> int:
@@ -185,7 +190,7 @@ def choice(name: str, value: Any, allowed: Sequence[Any]) -> Any:
     return value
 
 
-def instance(name: str, value: Any, kind: type | tuple[type, ...], needed: str) -> Any:
+def instance(name: str, value: Any, kind: type | UnionType | tuple[type, ...], needed: str) -> Any:
     """`value` if it is an instance of `kind`, described as `needed` in the message."""
     if not isinstance(value, kind):
         raise _error(name, value, needed)

@@ -36,7 +36,7 @@ from ..mechanics.balance import free_components, spread, with_locked
 from ..models.base import Outcome, Status, resolved
 from ..models.strain_dependent import StrainDependent
 from ..solution.equilibrium import Equilibrium
-from ..solution.solver import solve
+from ..solution.solver import admitted_status, solve
 from ..typing import Scalar, cast
 from ..validation import count, instance, numbers
 
@@ -96,9 +96,9 @@ def follow_branch(
 
     It starts at the equilibrium that `solve` finds at s = 0 and follows the curve by its arc length
     $\sigma$, in which the whole path counts 1 and bending counts its angle in radians (root mean
-    square along the arm). At a limit point s reverses. The branch ends at s = 1, or where the curve
-    returns to s = 0; remaining points repeat the end. Derivatives of the equilibria are taken at
-    fixed s and are unbounded at a limit point.
+    square along the arm). At a limit point s reverses. The branch ends at s = 1, or at s = 0 where
+    the curve returns to it; remaining points repeat the end. Derivatives of the equilibria are
+    taken at fixed s and are unbounded at a limit point.
 
     **Arguments:**
     - `scene`: a `Scene`, or a function of s that returns one, for loads or dimensions that change
@@ -110,8 +110,9 @@ def follow_branch(
       the end.
     - `step`: largest arc length between points; steps are shortened where the curve bends.
 
-    **Returns:** a `Branch`. Points after the last one that could be found have the status
-    `BRANCH_LOST`; without an equilibrium at s = 0 all points have the status of that solve.
+    **Returns:** a `Branch`. Points with inputs that an actuator cannot exert are `INADMISSIBLE`.
+    Points after the last one that could be found have the status `BRANCH_LOST`; without an
+    equilibrium at s = 0 all points have the status of that solve.
 
     **Raises:** `ValueError` for another model, and the errors of `solve` at s = 0.
     """
@@ -234,7 +235,9 @@ def _attempt(system: _System, longest: Array, walk: _Walk) -> _Walk:
     u, J, size, count = _corrected(system, goal, row)
     tangent = jnp.linalg.solve(jnp.concatenate([J, walk.tangent[None]]), _last_axis(u))
     tangent = tangent / jnp.linalg.norm(tangent)
-    sound = (size <= _small(u)) & (first | (tangent @ walk.tangent > _LEAST_COSINE))
+    inside = (u[-1] >= 0) & (u[-1] <= 1)  # a step beyond an end is cut, the next one lands on it
+    near = inside & (tangent @ walk.tangent > _LEAST_COSINE)
+    sound = (size <= _small(u)) & (first | near)
     longer = jnp.minimum(jnp.where(count <= _FEW_CORRECTIONS, 2 * length, length), longest)
     points, corrections = (
         walk.points.at[walk.found].set(u),
@@ -248,7 +251,7 @@ def _attempt(system: _System, longest: Array, walk: _Walk) -> _Walk:
         points,
         walk.found + 1,
         corrections,
-        over | (~first & (u[-1] <= 0)),
+        over,
     )
     cut = walk._replace(length=length / 2, cuts=walk.cuts + 1)
     return jax.tree.map(lambda a, b: jnp.where(sound, a, b), new, cut)
@@ -258,11 +261,15 @@ def _aim(walk: _Walk, first: Array) -> tuple[Array, Array, Array, Array]:
     """Prediction of the next point, normal of the plane it lies in, length of the step, and whether
     it is the end of the path.
 
-    The first point and the end of the path lie in planes of fixed s.
+    The first point and the ends of the path, s = 0 and s = 1, lie in planes of fixed s.
     """
-    over = ~first & (walk.u[-1] + walk.length * walk.tangent[-1] >= 1)
-    length = jnp.where(over, (1 - walk.u[-1]) / jnp.where(over, walk.tangent[-1], 1.0), walk.length)
+    s, slope = walk.u[-1], walk.tangent[-1]
+    ahead = s + walk.length * slope
+    over = ~first & ((ahead >= 1) | ((ahead <= 0) & (slope < 0)))
+    end = jnp.where(slope < 0, 0.0, 1.0)
+    length = jnp.where(over, (end - s) / jnp.where(over, slope, 1.0), walk.length)
     goal = jnp.where(first, walk.u, walk.u + length * walk.tangent)
+    goal = goal.at[-1].set(jnp.where(over, end, goal[-1]))
     return goal, jnp.where(first | over, _last_axis(walk.u), walk.tangent), length, over
 
 
@@ -313,4 +320,7 @@ def _equilibrium(system: _System, u: Array, status: Array, steps: Array) -> Equi
     outcome = resolved(
         system.model, scene, Outcome(unknown._replace(tension=()), forces, status, steps)
     )
+    allowed = admitted_status(outcome.status, scene, inputs)
+    found = outcome.status == Status.CONVERGED
+    outcome = outcome._replace(status=jnp.where(found, allowed, outcome.status))
     return Equilibrium(scene, inputs, system.model, outcome)

@@ -192,9 +192,8 @@ class Ellipsoid(NamedTuple):
 
 def ellipsoid(matrix: Float[Array, "3 columns"], centre: Float[Array, "3"]) -> Ellipsoid:
     r"""The set $\{c + A x : |x| \le 1\}$ for a centre c."""
-    U, lengths, _ = jnp.linalg.svd(matrix, full_matrices=True)
-    lengths = jnp.zeros(3, lengths.dtype).at[: lengths.size].set(lengths)
-    return Ellipsoid(centre, U * lengths)
+    U, lengths, _ = jnp.linalg.svd(matrix, full_matrices=False)
+    return Ellipsoid(centre, jnp.zeros((3, 3), U.dtype).at[:, : lengths.size].set(U * lengths))
 
 
 def manipulability(eq: Equilibrium, scale: ArrayLike = 1.0) -> Ellipsoid:

@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
-from ..arm.actuator import Chamber
 from ..arm.scene import Scene
 from ..solution.equilibrium import Equilibrium
 from ..validation import is_traced
@@ -26,30 +25,66 @@ _STATIONS = 17
 """Stations along the arm: profiles are smooth, so few are enough for a warning."""
 
 
+_PREFIXED = ("m", "Pa")
+"""Units that are written with a prefix."""
+_PREFIXES = ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "u"))
+
+
+def _readable(value: float, unit: str) -> str:
+    """A number with its unit and the prefix that leaves the fewest digits."""
+    if unit not in _PREFIXED:
+        return f"{value:g} {unit}"
+    factor, prefix = next(pair for pair in _PREFIXES if value >= pair[0])
+    return f"{value / factor:g} {prefix}{unit}"
+
+
 class _Range(NamedTuple):
-    """Plausible range of a number, and factors to SI units from units that are often confused."""
+    """Plausible range of a number, a sentence about it with {} for the range, and factors to SI
+    units from units that are often confused."""
 
     least: float
     most: float
     unit: str
-    slips: tuple[tuple[float, str], ...]
+    sentence: str
+    slips: tuple[tuple[float, str], ...] = ()
 
     def contains(self, value: float) -> bool:
         return self.least <= value <= self.most
 
-    def slip(self, value: float) -> str:
-        """Question that names the units the number may have; empty if none fits."""
-        fitting = [name for factor, name in self.slips if self.contains(value * factor)]
-        return f"; is it in {' or '.join(fitting)}?" if fitting else ""
+    @property
+    def usual(self) -> str:
+        """The sentence with the range."""
+        ends = [_readable(end, self.unit) for end in (self.least, self.most)]
+        if self.unit not in _PREFIXED:
+            ends[0] = f"{self.least:g}"
+        return self.sentence.format(" to ".join(ends))
+
+    def doubts(self, name: str, values: np.ndarray | float) -> Iterator[str]:
+        """A warning about the first of the values outside the range, with the units it may have."""
+        for value in np.atleast_1d(values).tolist():
+            if not self.contains(value):
+                fitting = [unit for factor, unit in self.slips if self.contains(value * factor)]
+                slip = f"; is it in {' or '.join(fitting)}?" if fitting else ""
+                yield f"{name}: {value:.6g} {self.unit}; {self.usual}{slip}"
+                return
 
 
 _METRIC = ((1e-3, "millimetres"),)
-_PRESSURE = ((1e6, "MPa"), (1e9, "GPa"))
-_LENGTH = _Range(1e-3, 20.0, "m", _METRIC)
-_THICKNESS = _Range(5e-6, 0.5, "m", _METRIC)
-_MODULUS = _Range(1e3, 2e12, "Pa", _PRESSURE)
-_DENSITY = _Range(50.0, 25000.0, "kg/m^3", ((1e3, "g/cm^3"),))
-_SLENDERNESS = _Range(3.0, 1e4, "", ())
+_LENGTH = _Range(1e-3, 20.0, "m", "arms are {} long", _METRIC)
+_THICKNESS = _Range(5e-6, 0.5, "m", "arms have {}", _METRIC)
+_SLENDERNESS = _Range(3.0, 1e4, "times", "rods are {}")
+_MODULUS = _Range(1e3, 2e12, "Pa", "materials have {}", ((1e6, "MPa"), (1e9, "GPa")))
+_DENSITY = _Range(50.0, 25000.0, "kg/m^3", "materials have {}", ((1e3, "g/cm^3"),))
+
+_RANGES = {
+    "rod.length": _LENGTH,
+    "rod.section: half thickness": _THICKNESS,
+    "rod.guide_radius": _THICKNESS,
+    "rod.material.young": _MODULUS,
+    "rod.material.shear": _MODULUS,
+    "rod.material.density": _DENSITY,
+}
+"""Ranges of a rod's numbers, by name."""
 
 
 class _Measures(NamedTuple):
@@ -84,56 +119,28 @@ def _unknown(tree: PyTree) -> bool:
 def _doubts(scene: Scene) -> Iterator[str]:
     rod, measures = scene.rod, jax.tree.map(np.asarray, _measured(scene))
     length, thickness = float(rod.length), float(np.mean(measures.thickness))
-    yield from _outside("rod.length", length, _LENGTH, "arms are 1 mm to 20 m long")
-    yield from _outside(
-        "rod.section: half thickness", thickness, _THICKNESS, "arms have 5 um to 0.5 m"
-    )
+    values = {"rod.length": length, "rod.section: half thickness": thickness}
+    values |= {f"rod.material.{name}": value for name, value in measures.material.items()}
     if rod.guide_radius is not None:
-        yield from _outside(
-            "rod.guide_radius", float(rod.guide_radius), _THICKNESS, "arms have 5 um to 0.5 m"
-        )
+        values["rod.guide_radius"] = float(rod.guide_radius)
+    for name, range_ in _RANGES.items():
+        if name in values:
+            yield from range_.doubts(name, values[name])
     slenderness = length / thickness
-    if (
-        _LENGTH.contains(length)
-        and _THICKNESS.contains(thickness)
-        and not _SLENDERNESS.contains(slenderness)
-    ):
+    sized = _LENGTH.contains(length) and _THICKNESS.contains(thickness)
+    if sized and not _SLENDERNESS.contains(slenderness):
         yield (
-            f"rod: {slenderness:.3g} times as long as half its thickness; "
-            "rods are 3 to 10000 times; are length and sizes in one unit?"
-        )
-    for name in ("young", "shear"):
-        if name in measures.material:
-            yield from _outside(
-                f"rod.material.{name}",
-                measures.material[name],
-                _MODULUS,
-                "materials have 1 kPa to 2 TPa",
-            )
-    if "density" in measures.material:
-        yield from _outside(
-            "rod.material.density",
-            measures.material["density"],
-            _DENSITY,
-            "materials have 50 to 25000 kg/m^3",
+            f"rod: {slenderness:.3g} times as long as half its thickness; {_SLENDERNESS.usual}; "
+            "are length and sizes in one unit?"
         )
     yield from _moduli(measures.material)
     for i, actuator in enumerate(scene.actuators):
-        if isinstance(actuator, Chamber) and float(actuator.area) > np.max(measures.area):
-            slip = (
-                "; is it in mm^2?" if 1e-6 * float(actuator.area) <= np.max(measures.area) else ""
-            )
+        area, most = actuator.pressure_area, np.max(measures.area)
+        if area is not None and float(area) > most:
+            slip = "; is it in mm^2?" if 1e-6 * float(area) <= most else ""
             yield (
-                f"actuators[{i}].area: {float(actuator.area):.6g} m^2; "
-                f"the section has {np.max(measures.area):.3g} m^2{slip}"
+                f"actuators[{i}].area: {float(area):.6g} m^2; the section has {most:.3g} m^2{slip}"
             )
-
-
-def _outside(name: str, values: np.ndarray | float, range_: _Range, usual: str) -> Iterator[str]:
-    for value in np.atleast_1d(values).tolist():
-        if not range_.contains(value):
-            yield f"{name}: {value:.6g} {range_.unit}; {usual}{range_.slip(value)}"
-            return
 
 
 def _moduli(material: dict[str, np.ndarray]) -> Iterator[str]:

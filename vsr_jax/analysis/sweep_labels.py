@@ -8,17 +8,15 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
-from ..arm.rod import STRAINS
 from ..arm.scene import Scene
 from ..files.scene_file import to_toml
 from ..models.base import Model, Status
-from ..models.basis import Basis
-from ..models.prescribed import Prescribed
 from ..models.strain_dependent import StrainDependent
 from ..solution.energy import Energy
-from ..solution.quantities import QUANTITIES
-from .sweep_program import Task, number
+from ..typing import VectorLike
+from .sweep_program import Task, number, stored_outputs
 
 
 class Label(NamedTuple):
@@ -42,8 +40,6 @@ class _Coordinate(NamedTuple):
     long_name: str
     values: np.ndarray
 
-
-_STEPS = Label(("sample",), {"long_name": "Newton steps", "units": "1"})
 
 _FORCES_AS_Q = "Coordinates of the strain in the model's basis: the thread forces"
 
@@ -73,7 +69,7 @@ _AXES = {
 
 
 def labels(
-    task: Task, like: Mapping[str, Any], samples: Any, flat: Mapping[str, np.ndarray]
+    task: Task, like: Mapping[str, Any], samples: PyTree, flat: Mapping[str, np.ndarray]
 ) -> Labels:
     """Labels of a sweep's store.
 
@@ -104,11 +100,12 @@ def labels(
 
 def _axes(named: tuple[str, ...]) -> dict[str, _Coordinate]:
     """Coordinates of the axes of the named quantities."""
-    dims = {dim for name in named if name != "steps" for dim in QUANTITIES[name].dims or ()}
+    known = stored_outputs()
+    dims = {dim for name in named for dim in known[name].dims}
     return {name: axis for name, axis in _AXES.items() if axis.dim in dims}
 
 
-def _given(task: Task, sample: Any) -> tuple[Scene, Any]:
+def _given(task: Task, sample: PyTree) -> tuple[Scene, VectorLike]:
     scene, inputs = task.given(sample)
     return scene, scene.check_inputs(inputs)
 
@@ -127,18 +124,11 @@ def _actuators(scene: Scene) -> dict[str, _Coordinate]:
 
 
 def _dofs(model: Model, size: int) -> dict[str, _Coordinate]:
-    """Names and units of the coordinates q; none for `StrainDependent`, whose coordinates are the
-    thread forces."""
-    if isinstance(model, StrainDependent):
+    """Names and units of the coordinates q; none where they are the thread forces."""
+    pairs = model.dof_labels(size)
+    if pairs is None:
         return {}
-    names, units = [f"q_{i}" for i in range(size)], ["unknown"] * size
-    if isinstance(model, Prescribed) and isinstance(model.basis, Basis):
-        families = model.basis.families
-        strains = [
-            (name, i) for name in STRAINS if name in families for i in range(families[name].size)
-        ]
-        names = [f"{name}_{i}" for name, i in strains]
-        units = ["1/m" if STRAINS.index(name) < 3 else "1" for name, _ in strains]
+    names, units = zip(*pairs, strict=True) if pairs else ((), ())
     return {
         "dof": _Coordinate("dof", "strain, and place in its family of functions", np.array(names)),
         "dof_units": _Coordinate("dof", "unit of each coordinate", np.array(units)),
@@ -167,12 +157,12 @@ def _output(name: str, x: Any, named: bool, coordinates: Mapping[str, _Coordinat
             {"long_name": f"output {name} of the function given to the sweep"},
             coordinates,
         )
-    if name == "steps":
-        return _STEPS
-    entry = QUANTITIES[name]
-    dims, unit, long_name = entry.dims or (), entry.unit, entry.description
+    _, dims, unit, long_name = stored_outputs()[name]
     if name == "q" and "dof" not in coordinates:
         dims, unit, long_name = ("actuator",), "N", _FORCES_AS_Q
+    for dim in dims:
+        if f"{dim}_units" in coordinates:
+            unit = f"see {dim}_units"
     return _labelled(("sample", *dims), {"long_name": long_name, "units": unit}, coordinates)
 
 

@@ -2,7 +2,7 @@
 devices."""
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,19 +10,48 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import PyTree
 
 from ..arm.scene import Scene
 from ..models.base import Model
+from ..solution.equilibrium import Equilibrium
+from ..solution.quantities import QUANTITIES, Quantity
 from ..solution.solver import solve
+from ..typing import VectorLike
 
 BATCH_SIZE = 512
 """Samples per batch on a CPU: larger batches do not fit its caches, smaller ones leave its kernels
 too little work."""
 
 
-def number(samples: Any) -> int:
+def number(samples: PyTree) -> int:
     """Number of samples in a pytree of arrays."""
     return len(jax.tree.leaves(samples)[0])
+
+
+class Output(NamedTuple):
+    """A quantity that a sweep can store: its value for an equilibrium, the names of the value's
+    axes, its unit and its description."""
+
+    value: Callable[[Equilibrium], Any]
+    dims: tuple[str, ...]
+    unit: str
+    description: str
+
+
+_STEPS = Output(lambda eq: eq.steps, (), "1", "Newton steps, or integration steps of Continuum")
+
+
+def stored_outputs() -> dict[str, Output]:
+    """The quantities that a sweep can store by name: those of the table that are a single array and
+    not a function of X, and the solver's `steps`."""
+    table = [entry for entry in QUANTITIES.values() if isinstance(entry, Quantity)]
+    found = {
+        entry.name: Output(entry, entry.dims, entry.unit, entry.description)
+        for entry in table
+        if entry.dims is not None
+    }
+    return found | {"steps": _STEPS}
 
 
 class Task(eqx.Module):
@@ -32,11 +61,11 @@ class Task(eqx.Module):
     model: Model | None
     outputs: tuple[str, ...] | Callable = eqx.field(static=True)
 
-    def given(self, sample: Any) -> tuple[Scene, Any]:
+    def given(self, sample: PyTree) -> tuple[Scene, VectorLike]:
         """Scene and inputs of a sample."""
         return (self.scene, sample) if isinstance(self.scene, Scene) else self.scene(sample)
 
-    def __call__(self, sample: Any) -> dict[str, Any]:
+    def __call__(self, sample: PyTree) -> dict[str, Any]:
         scene, inputs = self.given(sample)
         eq = solve(scene, inputs, model=self.model)
         if callable(self.outputs):
@@ -47,9 +76,8 @@ class Task(eqx.Module):
                     f"arrays by name, as a dict"
                 )
         else:
-            wanted = {
-                name: eq.steps if name == "steps" else eq.value(name) for name in self.outputs
-            }
+            known = stored_outputs()
+            wanted = {name: known[name].value(eq) for name in self.outputs}
         taken = [name for name in wanted if name == "status" or name.startswith("inputs")]
         if taken:
             raise ValueError(
@@ -71,7 +99,7 @@ class Program:
     the devices; `memory`: bound on memory [bytes].
     """
 
-    def __init__(self, task: Task, samples: Any, chunk: int, mesh: Mesh, memory: int):
+    def __init__(self, task: Task, samples: PyTree, chunk: int, mesh: Mesh, memory: int):
         self.chunk, self._task, self._samples, self._mesh = chunk, task, samples, mesh
         parts = mesh.devices.size
         batch_size = BATCH_SIZE if mesh.devices.flat[0].platform == "cpu" else -(-chunk // parts)
@@ -100,7 +128,7 @@ class Program:
         """Number of samples in a chunk."""
         return min(self.chunk, number(self._samples) - index * self.chunk)
 
-    def _placed(self, index: int) -> Any:
+    def _placed(self, index: int) -> PyTree:
         place = index * self.chunk + np.minimum(np.arange(self._rows), self.samples_in(index) - 1)
         return jax.device_put(
             jax.tree.map(lambda x: x[place], self._samples),
@@ -109,12 +137,12 @@ class Program:
 
 
 @eqx.filter_jit
-def _solved(task: Task, samples: Any, batch_size: int, mesh: Mesh) -> dict[str, Any]:
+def _solved(task: Task, samples: PyTree, batch_size: int, mesh: Mesh) -> dict[str, Any]:
     """Outputs of all samples in batches of `batch_size`; no loop waits for the samples of another
     device."""
     arrays, static = eqx.partition(task, eqx.is_array)
 
-    def part(arrays: Any, samples: Any) -> dict[str, Any]:
+    def part(arrays: PyTree, samples: PyTree) -> dict[str, Any]:
         rows = jax.tree.map(
             lambda x: x.reshape(len(x) // batch_size, batch_size, *x.shape[1:]), samples
         )

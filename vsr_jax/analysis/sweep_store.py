@@ -4,7 +4,6 @@ import hashlib
 import json
 import os
 import shutil
-import uuid
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -15,6 +14,7 @@ import jax
 import numpy as np
 from jax.experimental import multihost_utils
 
+from ..files.output import beside, replacing
 from .sweep_labels import Label, Labels
 
 try:
@@ -27,7 +27,7 @@ Arrays = Mapping[str, Any]
 
 _MISSING = -1
 _METADATA = "zarr.json"
-_SAID = 8
+_NAMED = 8
 """Damaged chunks that a warning names."""
 
 
@@ -112,7 +112,7 @@ class Archive:
                 self._create(zarr, like, chunk, labels, digest)
             except (ValueError, OSError) as found:
                 error = found
-        _meet(error)
+        _synchronise(error)
         self._finished = bool(_attributes(self._path, digest)["finished"])
         with zarr.config.set(
             {"array.write_empty_chunks": True}
@@ -154,10 +154,10 @@ class Archive:
                     lock = _locked(self._path)
                 except ValueError as found:
                     error = found
-            _meet(error)
+            _synchronise(error)
             self._repair()
             yield
-            _meet()
+            _synchronise()
             if leads and not self._finished:
                 _seal(self._path, finished=1)
         finally:
@@ -197,7 +197,7 @@ class Archive:
         """Removes damaged files, and rewrites samples and coordinates."""
         if not self._damaged:
             return
-        warnings.warn(self._said(), stacklevel=5)  # the caller of sweep
+        warnings.warn(self._damage_warning(), stacklevel=5)  # the caller of sweep
         for name, index in sorted(
             self._damaged, key=lambda place: place[0] != "status"
         ):  # status first: a chunk without it counts as missing
@@ -206,21 +206,21 @@ class Archive:
                 span = self._span(name, index)
                 self._arrays[name][span] = self._given[name][span]
 
-    def _said(self) -> str:
+    def _damage_warning(self) -> str:
         """The warning about damaged chunks."""
         spans = [(name, self._span(name, index)) for name, index in self._damaged]
-        said = ", ".join(f"{name}[{span.start}:{span.stop}]" for name, span in spans[:_SAID])
-        more = f" and {len(spans) - _SAID} more" if len(spans) > _SAID else ""
+        names = ", ".join(f"{name}[{span.start}:{span.stop}]" for name, span in spans[:_NAMED])
+        more = f" and {len(spans) - _NAMED} more" if len(spans) > _NAMED else ""
         return (
             f"sweep.out: {self._path} has missing or damaged chunks, which are restored "
-            f"(outputs computed again): {said}{more}"
+            f"(outputs computed again): {names}{more}"
         )
 
     def _create(self, zarr: Any, like: Arrays, chunk: int, labels: Labels, digest: str) -> None:
         """Creates the folder under a temporary name, then renames it atomically."""
         if not self._path.absolute().parent.is_dir():
             raise ValueError(f"sweep.out: there is no folder {str(self._path.absolute().parent)!r}")
-        draft = _beside(self._path)
+        draft = beside(self._path)
         try:
             group = zarr.open_group(draft, mode="w")
             group.attrs.update(labels.attributes)
@@ -300,9 +300,9 @@ def _seal(path: Path, **attributes: Any) -> None:
     root = json.loads((path / _METADATA).read_bytes())
     root["attributes"] |= attributes
     root["attributes"]["checksum"] = _checksum(path, root)
-    part = _beside(path)
-    part.write_text(json.dumps(root, indent=2), encoding="utf-8")
-    part.replace(path / _METADATA)
+    text = json.dumps(root, indent=2)
+    with replacing(path / _METADATA) as part:
+        part.write_text(text, encoding="utf-8")
 
 
 def _checksum(path: Path, root: dict[str, Any]) -> str:
@@ -335,11 +335,6 @@ def _locked(path: Path) -> int | None:
     return lock
 
 
-def _beside(path: Path) -> Path:
-    """A new hidden name in the parent folder of `path`."""
-    return path.with_name(f".{path.name}.{uuid.uuid4().hex}")
-
-
 def _zarr() -> Any:
     try:
         import zarr
@@ -360,7 +355,7 @@ def _any(here: bool) -> bool:
     )
 
 
-def _meet(error: Exception | None = None) -> None:
+def _synchronise(error: Exception | None = None) -> None:
     """Waits for all processes; if one has an error, all raise."""
     failed = _any(error is not None)
     if error is not None:

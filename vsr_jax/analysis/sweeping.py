@@ -9,25 +9,18 @@ from typing import Any, TypeAlias
 import jax
 import numpy as np
 from jax.sharding import Mesh
+from jaxtyping import PyTree
 from tqdm import tqdm
 
 from ..arm.scene import Scene
 from ..models.base import Model, Status
 from ..numerics.fingerprint import fingerprint
 from ..solution.equilibrium import Equilibrium
-from ..solution.quantities import QUANTITIES, Quantity
+from ..typing import VectorLike
 from ..validation import count
 from .sweep_labels import labels
-from .sweep_program import Program, Task, number
+from .sweep_program import Program, Task, number, stored_outputs
 from .sweep_store import Archive, InMemory
-
-
-def known_outputs() -> tuple[str, ...]:
-    """Names of the quantities that a sweep can store: those of the table that are a single array
-    and not a function of X, and the solver's `steps`."""
-    table = (entry for entry in QUANTITIES.values() if isinstance(entry, Quantity))
-    return (*(entry.name for entry in table if entry.dims is not None), "steps")
-
 
 _CHUNK = 16_384
 _MEMORY = 1 << 30
@@ -79,8 +72,8 @@ class Sweep(Mapping[str, Any]):
 
 
 def sweep(
-    scene: Scene | Callable[[Any], tuple[Scene, Any]],
-    inputs: Any,
+    scene: Scene | Callable[[PyTree], tuple[Scene, VectorLike]],
+    inputs: PyTree,
     *,
     outputs: Outputs = "tip",
     model: Model | None = None,
@@ -120,10 +113,10 @@ def sweep(
     - `progress`: whether to show a bar with rate and remaining time.
 
     **The store:** `tip` has the dimensions (sample, row, column), `inputs`, `lengths`, `forces` and
-    `slack` (sample, actuator), `q` (sample, dof), or (sample, actuator) where it is the thread
-    forces; outputs of a function have (sample, NAME_dim_1, ...), and so do the samples that a
-    function turns into scenes. Units are attributes, or coordinates where they differ along an
-    axis: `input_units`, `column_units`, `dof_units`. The tip position is
+    `slack` (sample, actuator), `energy` (sample, part), `q` (sample, dof), or (sample, actuator)
+    where it is the thread forces; outputs of a function have (sample, NAME_dim_1, ...), and so do
+    the samples that a function turns into scenes. Units are attributes, or coordinates where they
+    differ along an axis: `input_units`, `column_units`, `dof_units`. The tip position is
     `data.tip.sel(column="position", row=["x", "y", "z"])`. The attributes hold the model, the
     precision, the version and, as TOML, a scene that has no Python functions.
 
@@ -187,7 +180,7 @@ def _named(outputs: Outputs) -> tuple[str, ...] | Callable:
     if callable(outputs):
         return outputs
     names = (outputs,) if isinstance(outputs, str) else tuple(outputs)
-    known = known_outputs()
+    known = stored_outputs()
     unknown = [name for name in names if name not in known]
     if unknown:
         raise ValueError(
@@ -197,7 +190,7 @@ def _named(outputs: Outputs) -> tuple[str, ...] | Callable:
     return names
 
 
-def _samples(scene: Scene | Callable, inputs: Any) -> Any:
+def _samples(scene: Scene | Callable, inputs: PyTree) -> PyTree:
     """The samples as NumPy arrays, in the dtypes that JAX converts them to."""
     samples = jax.tree.map(
         lambda x: np.asarray(x, jax.dtypes.canonicalize_dtype(np.asarray(x).dtype)), inputs
@@ -226,7 +219,7 @@ def _samples(scene: Scene | Callable, inputs: Any) -> Any:
     return samples
 
 
-def _flat(samples: Any) -> dict[str, np.ndarray]:
+def _flat(samples: PyTree) -> dict[str, np.ndarray]:
     """The samples by name: `inputs`, followed by their path in the pytree, as in
     `inputs_radius`."""
     leaves = jax.tree_util.tree_flatten_with_path(samples)[0]
@@ -237,7 +230,7 @@ def _flat(samples: Any) -> dict[str, np.ndarray]:
 
 
 def _archive(
-    out: str | os.PathLike, task: Task, like: Mapping[str, Any], samples: Any, chunk: int
+    out: str | os.PathLike, task: Task, like: Mapping[str, Any], samples: PyTree, chunk: int
 ) -> Archive:
     flat = _flat(samples)
     digest = fingerprint(task, (jax.tree.map(lambda x: x[0], samples),), samples)

@@ -44,9 +44,26 @@ class Actuator(Part):
         return False
 
     @property
+    def signed_friction(self) -> Scalar | None:
+        """Coefficient of friction [-], positive while the thread is pulled and negative while it is
+        released; None if its force is the same everywhere."""
+        return None
+
+    @property
     def frictional(self) -> bool:
-        """Whether the force decays along the thread."""
-        return False
+        """Whether the force changes along the thread."""
+        return self.signed_friction is not None
+
+    @property
+    def cable_stiffness(self) -> Scalar | None:
+        """Axial stiffness [N] of a thread that is driven by its length; None if it cannot be
+        stretched."""
+        return None
+
+    @property
+    def pressure_area(self) -> Scalar | None:
+        """Area [m^2] on which a pressure acts; None if the input is no pressure."""
+        return None
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -191,8 +208,14 @@ class Tendon(Actuator):
         return self.control == "length"
 
     @property
-    def frictional(self) -> bool:
-        return self.friction is not None
+    def signed_friction(self) -> Scalar | None:
+        if self.friction is None or self.motion == "pull":
+            return self.friction
+        return -self.friction
+
+    @property
+    def cable_stiffness(self) -> Scalar | None:
+        return self.stiffness
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -238,6 +261,10 @@ class Chamber(Actuator):
     @property
     def unit(self) -> str:
         return "Pa"
+
+    @property
+    def pressure_area(self) -> Scalar:
+        return self.area
 
     def force(self, value: Scalar) -> Scalar:
         return value * self.area

@@ -6,19 +6,17 @@ reference length and $(M, F)$ [N m, N] at a point. Moments are about the point o
 load acts.
 """
 
-from collections.abc import Sequence
 from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from ..numerics.component import Vector3, Wrench, split
 from ..typing import ArrayLike, Scalar, VectorLike
 from ..validation import choice, numbers
 from .description import Part
-from .profile import FunctionOfX, Profile, ProfilesLike, as_profile
+from .profile import ProfilesLike, ProfileVector, as_profiles, breakpoints_of, values_at
 from .rod import Rod
 
 Frame = Literal["world", "body"]
@@ -157,6 +155,9 @@ class TipWrench(Load):
         return rod.length, (*_three(self.moment), *_three(self.force))
 
 
+_NEED = "three profiles, or a function of X that returns three numbers"
+
+
 class DistributedWrench(Load):
     """A force and a moment per reference length.
 
@@ -166,8 +167,8 @@ class DistributedWrench(Load):
     - `frame`: `"world"` for a dead load, `"body"` for one that rotates with the sections.
     """
 
-    force: tuple[Profile, ...] | FunctionOfX = eqx.field(metadata={"unit": "N/m"})
-    moment: tuple[Profile, ...] | FunctionOfX = eqx.field(metadata={"unit": "N"})
+    force: ProfileVector = eqx.field(metadata={"unit": "N/m"})
+    moment: ProfileVector = eqx.field(metadata={"unit": "N"})
     frame: Frame = eqx.field(static=True)
     effect = "distributed wrench"
 
@@ -177,46 +178,22 @@ class DistributedWrench(Load):
         moment: ProfilesLike = (0.0, 0.0, 0.0),
         frame: Frame = "world",
     ):
-        self.force = _three_profiles("DistributedWrench.force", force)
-        self.moment = _three_profiles("DistributedWrench.moment", moment)
+        self.force, self.moment = (
+            as_profiles(name, value, [f"{name}[{i}]" for i in range(3)], _NEED)
+            for name, value in (
+                ("DistributedWrench.force", force),
+                ("DistributedWrench.moment", moment),
+            )
+        )
         self.frame = choice("DistributedWrench.frame", frame, ("world", "body"))
 
     def density(self, rod: Rod, X: Scalar) -> Wrench:
-        return (*_at(self.moment, rod, X), *_at(self.force, rod, X))
+        mx, my, mz = values_at(self.moment, X, rod.length)
+        fx, fy, fz = values_at(self.force, X, rod.length)
+        return mx, my, mz, fx, fy, fz
 
     def breakpoints(self, rod: Rod) -> tuple[Scalar, ...]:
-        profiles = [
-            p
-            for vector in (self.force, self.moment)
-            if not isinstance(vector, FunctionOfX)
-            for p in vector
-        ]
-        return tuple(x for profile in profiles for x in profile.breakpoints)
-
-
-def _three_profiles(name: str, value: ProfilesLike) -> tuple[Profile, ...] | FunctionOfX:
-    if isinstance(value, FunctionOfX):
-        return value
-    if callable(value):
-        return FunctionOfX(name, value)
-    if (
-        isinstance(value, str)
-        or not isinstance(value, Sequence | np.ndarray | Array)
-        or len(value) != 3
-    ):
-        raise ValueError(
-            f"{name}: got {value!r}, need three profiles, or a function of X that returns three "
-            f"numbers"
-        )
-    return tuple(as_profile(f"{name}[{i}]", x) for i, x in enumerate(value))
-
-
-def _at(vector: tuple[Profile, ...] | FunctionOfX, rod: Rod, X: Scalar) -> Vector3:
-    if isinstance(vector, FunctionOfX):
-        x, y, z = (jnp.asarray(value, X.dtype) for value in vector(X))
-    else:
-        x, y, z = (profile(X, rod.length) for profile in vector)
-    return x, y, z
+        return breakpoints_of(self.force) + breakpoints_of(self.moment)
 
 
 def _three(array: Float[Array, "3"]) -> Vector3:

@@ -249,6 +249,43 @@ def as_profile(
     return Constant(check(name, value))
 
 
+ProfileVector = tuple[Profile, ...] | FunctionOfX
+"""Several profiles, or one function of X that returns as many numbers."""
+
+
+def as_profiles(name: str, value: ProfilesLike, labels: Sequence[str], need: str) -> ProfileVector:
+    """`value` as profiles, one per label, from a sequence of what `as_profile` accepts or from one
+    function of X.
+
+    **Arguments:** `labels`: name of each profile in messages; `need`: what is needed, in words.
+    """
+    if isinstance(value, FunctionOfX):
+        return value
+    if callable(value):
+        return FunctionOfX(name, value)
+    if (
+        isinstance(value, str)
+        or not isinstance(value, Sequence | np.ndarray | Array)
+        or len(value) != len(labels)
+    ):
+        raise ValueError(f"{name}: got {value!r}, need {need}")
+    return tuple(as_profile(label, x) for label, x in zip(labels, value, strict=True))
+
+
+def values_at(profiles: ProfileVector, X: Scalar, length: Scalar) -> tuple[Scalar, ...]:
+    """Value of each profile at X [m]."""
+    if isinstance(profiles, FunctionOfX):
+        return tuple(jnp.asarray(value, X.dtype) for value in profiles(X))
+    return tuple(profile(X, length) for profile in profiles)
+
+
+def breakpoints_of(profiles: ProfileVector) -> tuple[Scalar, ...]:
+    """Abscissas [m] where a profile or its derivative jumps; none for a function of X."""
+    if isinstance(profiles, FunctionOfX):
+        return ()
+    return tuple(x for profile in profiles for x in profile.breakpoints)
+
+
 _LINEAR_IN = {
     Constant: ("value",),
     Taper: ("base", "tip"),

@@ -1,10 +1,7 @@
 """The rod: a slender arm with its section, material, rest strain and base."""
 
-from collections.abc import Sequence
-
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 
 from ..numerics.component import Vector, norm
@@ -12,7 +9,14 @@ from ..typing import ArrayLike, MatrixLike, Pose, Scalar
 from ..validation import instance, numbers, rigid
 from .description import Part
 from .material import Material
-from .profile import FunctionOfX, Limits, Profile, ProfilesLike, as_profile
+from .profile import (
+    Limits,
+    ProfilesLike,
+    ProfileVector,
+    as_profiles,
+    breakpoints_of,
+    values_at,
+)
 from .section import Section
 
 STRAINS = ("torsion", "bending_y", "bending_z", "elongation", "shear_y", "shear_z")
@@ -43,7 +47,7 @@ class Rod(Part):
     length: Scalar = eqx.field(metadata={"unit": "m"})
     section: Section
     material: Material
-    rest_strain: tuple[Profile, ...] | FunctionOfX = eqx.field(metadata={"unit": _STRAIN_UNITS})
+    rest_strain: ProfileVector = eqx.field(metadata={"unit": _STRAIN_UNITS})
     base: Pose | None = eqx.field(metadata={"unit": "-"})
     guide_radius: Scalar | None = eqx.field(metadata={"unit": "m"})
 
@@ -65,7 +69,12 @@ class Rod(Part):
             "a section such as Circular, Annular, Rectangular or Elliptic",
         )
         self.material = instance("Rod.material", material, Material, "a Material")
-        self.rest_strain = _rest_strain(rest_strain)
+        self.rest_strain = as_profiles(
+            "Rod.rest_strain",
+            STRAIGHT if rest_strain is None else rest_strain,
+            [f"Rod.rest_strain ({name})" for name in STRAINS],
+            f"six profiles in the order {', '.join(STRAINS)}, or a function of X",
+        )
         self.base = None if base is None else rigid("Rod.base", base)
         self.guide_radius = (
             None
@@ -75,9 +84,7 @@ class Rod(Part):
 
     def rest(self, X: Scalar) -> Vector:
         """Rest strain $\\xi^*$ at X [m], six scalars."""
-        if isinstance(self.rest_strain, FunctionOfX):
-            return tuple(jnp.asarray(x, X.dtype) for x in self.rest_strain(X))
-        return tuple(profile(X, self.length) for profile in self.rest_strain)
+        return values_at(self.rest_strain, X, self.length)
 
     def stiffness(self, X: Scalar) -> Vector:
         """Diagonal of $\\Sigma$ at X [m], six scalars [N m^2] and [N]."""
@@ -116,30 +123,8 @@ class Rod(Part):
     def breakpoints(self) -> tuple[Scalar, ...]:
         """Abscissas [m] where a size, a material property, the rest strain or one of their
         derivatives jumps."""
-        rest = () if isinstance(self.rest_strain, FunctionOfX) else self.rest_strain
         return (
             *self.section.breakpoints,
             *self.material.breakpoints,
-            *(x for profile in rest for x in profile.breakpoints),
+            *breakpoints_of(self.rest_strain),
         )
-
-
-def _rest_strain(value: ProfilesLike | None) -> tuple[Profile, ...] | FunctionOfX:
-    if value is None:
-        value = STRAIGHT
-    if isinstance(value, FunctionOfX):
-        return value
-    if callable(value):
-        return FunctionOfX("Rod.rest_strain", value)
-    if (
-        isinstance(value, str)
-        or not isinstance(value, Sequence | np.ndarray | Array)
-        or len(value) != 6
-    ):
-        raise ValueError(
-            f"Rod.rest_strain: got {value!r}, need six profiles in the order "
-            f"{', '.join(STRAINS)}, or a function of X"
-        )
-    return tuple(
-        as_profile(f"Rod.rest_strain ({name})", x) for name, x in zip(STRAINS, value, strict=True)
-    )

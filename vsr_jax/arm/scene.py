@@ -308,12 +308,21 @@ def _rest_length(scene: Scene, place: int) -> Scalar:
     return jnp.sum(grid.weight * jnp.sqrt(dot(t_c, t_c)) * (1.0 if reach is None else reach))
 
 
+_PROBES = 65
+"""Evenly spaced abscissas at which limits are checked, besides the breakpoints and the middles
+between them."""
+
+
 @eqx.filter_jit
 def _probe(scene: Scene) -> tuple[Array, Limits, list[Array]]:
     """Abscissas X [m] along the arm and, at each, the numbers of the rod that have limits and the
     clearance of each thread [m]."""
     rod = scene.rod
-    X = jnp.linspace(0, 1, 65) * rod.length
+    # between the breakpoints too, where a short piece may lie between evenly spaced abscissas
+    edges = scene.edges()
+    X = jnp.concatenate(
+        [jnp.linspace(0, 1, _PROBES) * rod.length, edges, 0.5 * (edges[1:] + edges[:-1])]
+    )
 
     def clearance(actuator: Actuator, x: Scalar) -> Array:
         inside, reach = rod.clearance(*actuator.routing(x), x), actuator.reach(x)

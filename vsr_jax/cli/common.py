@@ -68,16 +68,21 @@ def warn(sentences: Iterable[str]) -> None:
 
 
 def add_bounds(parser: argparse.ArgumentParser, default: str) -> None:
-    """Adds `--low` and `--high`, see `bounds`; `default` describes the default of `--high`."""
+    """Adds `--low` and `--high`, see `bounds`; `default` describes the default inputs."""
     parser.add_argument(
         "--low",
         metavar="U",
         nargs="+",
         type=float,
-        help="least inputs, one number for all or one per actuator (default: 0)",
+        help=f"least inputs, one number for all or one per actuator (default: {default}, where "
+        f"negative, else 0)",
     )
     parser.add_argument(
-        "--high", metavar="U", nargs="+", type=float, help=f"greatest inputs (default: {default})"
+        "--high",
+        metavar="U",
+        nargs="+",
+        type=float,
+        help=f"greatest inputs (default: {default}, where positive, else 0)",
     )
 
 
@@ -100,16 +105,16 @@ def set_precision(precision: str) -> None:
 def bounds(
     low: Sequence[float] | None, high: Sequence[float] | None, default: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Least and greatest inputs, one number per actuator, from `--low` and `--high`; by default 0
-    and `default`.
+    """Least and greatest inputs, one number per actuator, from `--low` and `--high`; by default the
+    range from 0 to `default`, which may be negative.
 
     **Raises:** `ValueError` for a wrong number of values, and if a lower bound exceeds its upper
     bound.
     """
     pair = []
     for name, values in (
-        ("--low", [0.0] if low is None else low),
-        ("--high", default if high is None else high),
+        ("--low", np.minimum(default, 0.0) if low is None else low),
+        ("--high", np.maximum(default, 0.0) if high is None else high),
     ):
         if len(values) not in (1, len(default)):
             raise ValueError(
@@ -121,6 +126,13 @@ def bounds(
         low_row, high_row = (" ".join(f"{value:g}" for value in row) for row in pair)
         raise ValueError(f"--low: got {low_row}, need at most --high, {high_row}")
     return pair[0], pair[1]
+
+
+def draw_without_display() -> None:
+    """Selects the backend of matplotlib that only writes files; call it before drawing."""
+    import matplotlib
+
+    matplotlib.use("Agg")
 
 
 def reduce_compile_time(*, optimise: bool) -> None:

@@ -8,7 +8,8 @@ import numpy as np
 
 from ..analysis.plausible import warnings_of
 from ..arm.scene import Scene
-from ..files.scene_file import save as save_scene
+from ..files.output import write_json
+from ..files.scene_file import save
 from .common import (
     DONE,
     NOT_CONVERGED,
@@ -16,11 +17,12 @@ from .common import (
     add_precision,
     check_folders,
     command,
+    draw_without_display,
     reduce_compile_time,
     set_precision,
     warn,
 )
-from .scene_commands import save
+from .compiling import add_cache
 
 
 def add_design(commands: Commands) -> None:
@@ -32,8 +34,7 @@ def add_design(commands: Commands) -> None:
         description="Finds numbers of a scene that minimise objectives under constraints, as "
         "specified by a problem file.",
         example="vsr-jax design problem.toml --out designed.toml --plot design.png",
-        more="  Problem files: see `python -c 'import vsr_jax.optimization.design_file as d; "
-        "print(d.__doc__)'`; an example is in notebooks/problems/.\n"
+        more="  Problem files: see docs/files.md; an example is in notebooks/problems/.\n"
         "  Exit code 1: no design satisfies all constraints.",
         run=_design,
     )
@@ -63,6 +64,7 @@ def add_design(commands: Commands) -> None:
         help="checkpoint file; the same command resumes from it",
     )
     add_precision(parser)
+    add_cache(parser)
 
 
 def _design(options: argparse.Namespace) -> int:
@@ -88,7 +90,7 @@ def _design(options: argparse.Namespace) -> int:
     print(problem.title or options.problem)
     print(textwrap.indent(str(found), "  "))
     if options.out:
-        save_scene(found.scene, options.out, found.inputs[0], problem.title)
+        save(found.scene, options.out, found.inputs[0], problem.title)
     if options.json:
         record = {
             "title": problem.title,
@@ -97,12 +99,12 @@ def _design(options: argparse.Namespace) -> int:
             "margins": found.margins,
         }
         starts = [{"objective": one.objective, "violation": one.violation} for one in found.starts]
-        save(
+        write_json(
             options.json,
             {
                 **record,
-                "numbers": {name: np.asarray(x).tolist() for name, x in found.numbers.items()},
-                "inputs": np.asarray(found.inputs).tolist(),
+                "numbers": found.numbers,
+                "inputs": found.inputs,
                 "starts": starts,
             },
         )
@@ -112,9 +114,7 @@ def _design(options: argparse.Namespace) -> int:
 
 
 def _draw(scene: Scene, found: Any, inputs: np.ndarray, path: str) -> None:
-    import matplotlib
-
-    matplotlib.use("agg")
+    draw_without_display()
     import matplotlib.pyplot as plt
 
     from ..viz import plot_design

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..analysis.plausible import strain_warnings
+from ..files.output import write_json
 from . import report
 from .common import (
     DONE,
@@ -19,7 +20,7 @@ from .common import (
     reduce_compile_time,
     warn,
 )
-from .scene_commands import add_scene, model_between, save, task_of
+from .scene_commands import add_scene, model_between, task_of
 
 
 def add_reach(commands: Commands) -> None:
@@ -70,17 +71,18 @@ def _reach(options: argparse.Namespace) -> int:
         model=model,
         allowed_miss=options.allowed_miss,
     )
-    print("\n".join(report.lines(found.equilibrium, task.title or options.scene)))
+    eq = found.equilibrium
+    print("\n".join(report.lines(eq, report.values(eq), task.title or options.scene)))
     print(textwrap.indent(str(found), "  "))
-    warn(strain_warnings(found.equilibrium))
+    warn(strain_warnings(eq))
     if options.json:
         outcome = {
             "target": options.target,
-            "inputs": np.asarray(found.inputs).tolist(),
-            "miss": float(found.miss),
-            "allowed_miss": float(found.allowed_miss),
-            "reached": bool(found.reached),
-            "tip": np.asarray(found.equilibrium.tip).tolist(),
+            "inputs": found.inputs,
+            "miss": found.miss,
+            "allowed_miss": found.allowed_miss,
+            "reached": found.reached,
+            "tip": found.equilibrium.tip,
         }
-        save(options.json, {"scene": options.scene, "title": task.title, **outcome})
+        write_json(options.json, {"scene": options.scene, "title": task.title, **outcome})
     return DONE if bool(found.reached) else NOT_CONVERGED

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from .. import __version__
 from .common import BAD_USAGE, EXIT_CODES
+from .compiling import compiling
 from .design_commands import add_design
 from .inverse_commands import add_reach
 from .scene_commands import add_check, add_solve
@@ -38,7 +39,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         [_spaced(argument) for argument in (sys.argv[1:] if argv is None else argv)]
     )
     try:
-        return options.run(options)
+        with compiling(options):
+            return options.run(options)
     except (ValueError, OSError, ImportError) as error:
         print(f"vsr-jax: {' '.join(str(error).split())}", file=sys.stderr)
         return BAD_USAGE

@@ -1,10 +1,9 @@
 """The commands for a scene file: `solve` solves it, `check` reports the health of the solve."""
 
 import argparse
-import json
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -14,6 +13,7 @@ from jaxtyping import Array
 from ..analysis.health import check
 from ..analysis.plausible import strain_warnings, warnings_of
 from ..arm.scene import Scene
+from ..files.output import write_json
 from ..files.scene_file import load
 from ..models.base import Model
 from ..models.basis import Basis, Legendre
@@ -28,11 +28,13 @@ from .common import (
     add_precision,
     check_folders,
     command,
+    draw_without_display,
     positive_integer,
     reduce_compile_time,
     set_precision,
     warn,
 )
+from .compiling import add_cache
 
 MODELS = ("strain-dependent", "prescribed", "continuum")
 """Names of the models, the most used first."""
@@ -88,11 +90,11 @@ def add_check(commands: Any) -> None:
         commands,
         "check",
         help="report the health of the solve of a scene file",
-        description="Solves the scene of a TOML file and about seventy variants of it. Prints the "
-        "status, the stability margin,\n"
-        "how far inputs and loads may grow and how the solve fails beyond, the change of the tip "
-        "with finer steps,\n"
-        "the conditioning, and advice.",
+        description="Solves the scene of a TOML file and 65 variants of it, 129 for a scene with "
+        "inputs and loads. Prints the\n"
+        "status, the stability margin, how far inputs and loads may grow and how the solve fails "
+        "beyond, the change\n"
+        "of the tip with finer steps, the conditioning, and advice.",
         example="vsr-jax check scene.toml --inputs 8 2.5",
         run=_check,
     )
@@ -130,6 +132,7 @@ def add_scene(parser: argparse.ArgumentParser) -> None:
         help="error bound of the tip in metres, which sets the steps; instead of --steps",
     )
     add_precision(parser)
+    add_cache(parser)
 
 
 class SceneTask(NamedTuple):
@@ -141,26 +144,35 @@ class SceneTask(NamedTuple):
     title: str
 
 
-def task_of(options: argparse.Namespace) -> SceneTask:
-    """The task of the command line, in the requested precision; warns about implausible numbers.
+def read_task(path: str, inputs: Sequence[float] | None, precision: str = "float64") -> SceneTask:
+    """The task of a scene file, with the default model; warns about implausible numbers.
+
+    **Arguments:** `path`: the file; `inputs`: from the command line, None for those of the file;
+    `precision`: of all numbers.
 
     **Raises:** `ValueError` for an invalid file or invalid numbers.
     """
-    set_precision(options.precision)
-    scene, inputs, title = load(options.scene)
+    set_precision(precision)
+    scene, stored, title = load(path)
     warn(warnings_of(scene))
-    inputs = inputs if options.inputs is None else options.inputs
-    if inputs is None and scene.actuators:
+    values = stored if inputs is None else inputs
+    if values is None and scene.actuators:
         kinds = ", ".join(type(actuator).__name__ for actuator in scene.actuators)
-        raise ValueError(
-            f"{options.scene}: has no inputs, need --inputs, one number each for {kinds}"
-        )
-    values = jnp.asarray([] if inputs is None else inputs, options.precision)
+        raise ValueError(f"{path}: has no inputs, need --inputs, one number each for {kinds}")
+    return SceneTask(scene, jnp.asarray([] if values is None else values, precision), None, title)
+
+
+def task_of(options: argparse.Namespace) -> SceneTask:
+    """The task of the arguments that `add_scene` adds.
+
+    **Raises:** `ValueError` as `read_task`, and for a tolerance together with a model.
+    """
+    task = read_task(options.scene, options.inputs, options.precision)
     if options.tolerance is not None and (options.model, options.steps) != (None, None):
         raise ValueError(
             "--tolerance: got --model or --steps too, need one or the other: a tolerance sets both"
         )
-    return SceneTask(scene, values, _model(options.model, options.steps, scene), title)
+    return task._replace(model=_model(options.model, options.steps, task.scene))
 
 
 def model_between(
@@ -184,8 +196,6 @@ def _solve(options: argparse.Namespace) -> int:
 
 
 def _check(options: argparse.Namespace) -> int:
-    from . import report
-
     reduce_compile_time(optimise=True)
     scene, inputs, model, title = task_of(options)
     check_folders(options.json)
@@ -195,37 +205,34 @@ def _check(options: argparse.Namespace) -> int:
         else solve(scene, inputs, tolerance=options.tolerance).model
     )
     health = check(scene, inputs, model=model)
-    print("\n".join(report.health_lines(health, title or options.scene)))
+    print(title or options.scene, health, sep="\n")
     warn(strain_warnings(health.equilibrium))
     if options.json:
-        save(options.json, {"scene": options.scene, "title": title, **report.health_record(health)})
+        write_json(options.json, {"scene": options.scene, "title": title, **health.record()})
     return DONE if bool(health.equilibrium.converged) else NOT_CONVERGED
 
 
 def _tell(eq: Equilibrium, title: str, options: argparse.Namespace) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from ..viz import plot
     from . import report
 
-    print("\n".join(report.lines(eq, title or options.scene, error=options.tolerance is not None)))
-    samples = None
-    if bool(eq.converged) and (options.plot or options.json):
-        samples = plot.sample(eq, np.linspace(0.0, float(eq.scene.rod.length), STATIONS))
+    found = report.summary(eq, STATIONS) if options.plot or options.json else None
+    values = report.values(eq) if found is None else found.values
+    error = options.tolerance is not None
+    print("\n".join(report.lines(eq, values, title or options.scene, error=error)))
     if options.json:
-        save(options.json, {"scene": options.scene, "title": title, **report.record(eq, samples)})
-    if options.plot and samples is not None:
-        ax = plot.arm(samples)
-        ax.set_title(title)
-        ax.figure.savefig(options.plot, dpi=200, bbox_inches="tight")
+        write_json(
+            options.json, {"scene": options.scene, "title": title, **report.record(eq, found)}
+        )
+    if options.plot and found is not None:
+        draw_without_display()
+        import matplotlib.pyplot as plt
+
+        from ..viz import plot
+
+        plot.arm(found).set_title(title)
+        plt.savefig(options.plot, dpi=200, bbox_inches="tight")
     elif options.plot:
         print(f"vsr-jax: {options.plot} is not drawn: the solve failed", file=sys.stderr)
-
-
-def save(path: str, content: Any) -> None:
-    """Writes a JSON file."""
-    Path(path).write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def _model(name: str | None, steps: int | None, scene: Scene) -> Model | None:

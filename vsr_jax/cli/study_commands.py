@@ -8,9 +8,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..files.output import write_json
 from ..models.strain_dependent import StrainDependent
-from .common import DONE, NOT_CONVERGED, Commands, check_folders, command, positive_integer
-from .scene_commands import SceneTask, save, task_of
+from .common import (
+    DONE,
+    NOT_CONVERGED,
+    Commands,
+    check_folders,
+    command,
+    draw_without_display,
+    positive_integer,
+)
+from .scene_commands import SceneTask, read_task
 
 _GROUPS = ("steps", "bases", "continuum")
 """Copy of `studies.accuracy.GROUPS`; importing it takes a second."""
@@ -100,7 +109,6 @@ def add_accuracy(commands: Commands) -> None:
     parser.add_argument(
         "--groups", nargs="+", choices=_GROUPS, default=list(_GROUPS), help="models (default: all)"
     )
-    parser.set_defaults(model=None, steps=None, precision="float64")
     parser.add_argument(
         "--batch-size",
         type=positive_integer,
@@ -114,10 +122,8 @@ def add_accuracy(commands: Commands) -> None:
 
 
 def _paper(options: argparse.Namespace) -> int:
-    import matplotlib
-
     jax.config.update("jax_enable_x64", True)
-    matplotlib.use("Agg")
+    draw_without_display()
     from ..studies import reproduction
     from ..studies.paper import CASES
 
@@ -147,7 +153,7 @@ def _effects(options: argparse.Namespace) -> int:
     )
     print("\n".join(effects.table(costs)))
     if options.json:
-        save(options.json, [cost._asdict() for cost in costs])
+        write_json(options.json, [cost._asdict() for cost in costs])
     return DONE if all(cost.converged == 1 for cost in costs) else NOT_CONVERGED
 
 
@@ -160,14 +166,13 @@ def _two_helices(inputs: list[float] | None) -> SceneTask:
 
 
 def _accuracy(options: argparse.Namespace) -> int:
-    import matplotlib
-
     jax.config.update("jax_enable_x64", True)
-    matplotlib.use("Agg")
-    from ..studies import accuracy, accuracy_figures
+    from ..studies import accuracy
 
     check_folders(options.plot, options.json)
-    task = task_of(options) if options.scene else _two_helices(options.inputs)
+    task = (
+        read_task(options.scene, options.inputs) if options.scene else _two_helices(options.inputs)
+    )
     shares = np.random.default_rng(0).uniform(0.1, 1.0, (options.batch_size, task.inputs.size))
     settings = accuracy.settings(task.scene, groups=options.groups)
     rows = accuracy.measure(
@@ -179,7 +184,10 @@ def _accuracy(options: argparse.Namespace) -> int:
     print("\n".join([*accuracy.table(rows), "", *accuracy.advice(rows)]))
     title = task.title or options.scene
     if options.json:
-        save(options.json, {title: [row._asdict() for row in rows]})
+        write_json(options.json, {title: [row._asdict() for row in rows]})
     if options.plot:
+        draw_without_display()
+        from ..studies import accuracy_figures
+
         accuracy_figures.work_precision({title: rows}).savefig(options.plot, dpi=150)
     return DONE if any(row.tip is not None for row in rows) else NOT_CONVERGED

@@ -7,10 +7,10 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 
-from ..analysis.sweeping import Sweep, known_outputs, sweep
+from ..analysis.sweep_program import stored_outputs
+from ..analysis.sweeping import Sweep, sweep
 from .common import (
     DONE,
     NOT_CONVERGED,
@@ -18,6 +18,7 @@ from .common import (
     bounds,
     check_folders,
     command,
+    draw_without_display,
     one_device_per_core,
     positive_integer,
 )
@@ -54,7 +55,7 @@ def add_sweep(commands: Any) -> None:
     parser.add_argument(
         "--outputs",
         nargs="+",
-        choices=known_outputs(),
+        choices=tuple(stored_outputs()),
         default=["tip"],
         help="quantities to store besides the status (default: tip)",
     )
@@ -113,7 +114,7 @@ def _lines(
 def _draw(
     path: str, title: str, tips: np.ndarray, inputs: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> None:
-    matplotlib.use("Agg")
+    draw_without_display()
     from ..viz import plot
 
     varied = high != low  # the mean of many inputs carries no information

@@ -13,8 +13,7 @@ import difflib
 import inspect
 import re
 import tomllib
-import uuid
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,6 +32,7 @@ from ..arm.scene import Scene
 from ..arm.section import Annular, Circular, Elliptic, Joined, Rectangular
 from ..typing import PathLike, VectorLike
 from ..validation import concrete
+from .output import replacing
 
 Group = dict[str, type]
 
@@ -143,13 +143,9 @@ def save(scene: Scene, path: PathLike, inputs: VectorLike | None = None, title: 
 
     The write is atomic: an interrupted call leaves the previous file.
     """
-    text, file = to_toml(scene, inputs, title), Path(path)
-    part = file.with_name(f".{file.name}.{uuid.uuid4().hex}")
-    try:
+    text = to_toml(scene, inputs, title)
+    with replacing(path) as part:
         part.write_text(text, encoding="utf-8")
-        part.replace(file)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _on_one_line(match: re.Match[str]) -> str:
@@ -185,11 +181,25 @@ def kind_of(table: Table, path: str, group: Group) -> type:
 
 
 def _build(kind: type, table: Table, path: str) -> Any:
+    def read(key: str, value: Any) -> Any:
+        return _read(value, _below(path, key), _GROUPS.get(key, _PROFILES))
+
+    return construct(kind, table, path, read)
+
+
+def construct(
+    kind: type, table: Table, path: str, read: Callable[[str, Any], Any] = lambda key, value: value
+) -> Any:
+    """The object of a class with the arguments in a table.
+
+    **Arguments:** `path`: of the table's key; `read`: function of a key and its value that returns
+    the argument.
+
+    **Raises:** `ValueError` with the path for unknown and missing keys, and for arguments that the
+    class rejects.
+    """
     check_keys(kind, table, path)
-    given = {
-        key: _read(value, _below(path, key), _GROUPS.get(key, _PROFILES))
-        for key, value in table.items()
-    }
+    given = {key: read(key, value) for key, value in table.items()}
     try:
         return kind(**given)
     except (ValueError, TypeError, OverflowError) as error:

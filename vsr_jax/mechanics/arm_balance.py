@@ -18,7 +18,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..arm.actuator import Tendon
 from ..arm.scene import CrossSections, Scene, shared
 from ..numerics import component as c
 from ..numerics.component import Forces, Vector
@@ -127,21 +126,32 @@ def with_tensions(forces: Forces, tensions: Iterable[Array], kind: Kind) -> Forc
 def state_of(unknown: ArmUnknown, problem: ArmProblem, kind: Kind) -> ArmState:
     """Quantities computed from the unknowns."""
     grid, sections, xi = problem.grid, problem.sections, unknown.xi
-    carried = list(sections.reach)
-    if problem.friction is not None:
-        for place, turning, mu in zip(
-            kind.frictional, unknown.turning, problem.friction.coefficients, strict=True
-        ):
-            kinks = kinks_of(xi, sections, problem.friction.breaks, place, grid)
-            carried[place] = share_left(carried[place], turning, kinks, mu, grid)
-    forces = with_tensions(problem.forces, unknown.tension, kind)
-    tau = shared(forces, tuple(carried))
+    carried = _shares(unknown, problem, kind)
+    tau = shared(with_tensions(problem.forces, unknown.tension, kind), carried)
     along = None if problem.loads is None else react(xi, grid, problem.loads)
     slack = tuple(
         cable.slack(tension, path_length(xi, sections, place, grid), carried[place], grid)
         for place, cable, tension in zip(kind.cables, problem.cables, unknown.tension, strict=True)
     )
-    return ArmState(tuple(carried), tau, along, slack)
+    return ArmState(carried, tau, along, slack)
+
+
+def carried_forces(unknown: ArmUnknown, problem: ArmProblem, kind: Kind) -> Forces:
+    """Force of each thread at the nodes."""
+    forces = with_tensions(problem.forces, unknown.tension, kind)
+    return shared(forces, _shares(unknown, problem, kind))
+
+
+def _shares(unknown: ArmUnknown, problem: ArmProblem, kind: Kind) -> tuple[Array | None, ...]:
+    """Share of each thread's force at the nodes."""
+    sections, carried = problem.sections, list(problem.sections.reach)
+    if problem.friction is not None:
+        for place, turning, mu in zip(
+            kind.frictional, unknown.turning, problem.friction.coefficients, strict=True
+        ):
+            kinks = kinks_of(unknown.xi, sections, problem.friction.breaks, place, problem.grid)
+            carried[place] = share_left(carried[place], turning, kinks, mu, problem.grid)
+    return tuple(carried)
 
 
 def shares_at(
@@ -162,10 +172,9 @@ def shares_at(
 
 
 def _signed_friction(scene: Scene, place: int) -> Array:
-    tendon = scene.actuators[place]
-    assert isinstance(tendon, Tendon)
-    assert tendon.friction is not None
-    return tendon.friction if tendon.motion == "pull" else -tendon.friction
+    friction = scene.actuators[place].signed_friction
+    assert friction is not None  # see Scene.frictional
+    return friction
 
 
 def imbalance_of(

@@ -41,35 +41,39 @@ from .balance import (
 )
 
 
-def solve_arm(problem: ArmProblem, kind: Kind) -> Root:
-    """Equilibrium of the arm; its point is an `ArmUnknown`. Newton's method starts from the balance
-    without loads and with slack cables.
+def solve_arm(problem: ArmProblem, kind: Kind, guess: ArmUnknown | None = None) -> Root:
+    """Equilibrium of the arm; its point is an `ArmUnknown`. Newton's method starts from a guess, if
+    one is given, else or where that fails from the balance without loads and with slack cables.
 
     Derivatives are implicit, of any order, in forward and reverse mode: the exact tangent system is
     solved by iterative refinement of `approximate_solve`.
     """
 
-    def find(problem: ArmProblem) -> Root:
-        root = side_by_side(partial(_solve, kind))(_start(problem, kind), problem)
+    def find(problem: ArmProblem, guess: ArmUnknown | None) -> Root:
+        if guess is not None:  # the iteration does not change the locked strains
+            guess = guess._replace(xi=with_locked(guess.xi, problem.sections.rest, kind.free))
+        root = side_by_side(partial(_solve, kind))(_start(problem, kind), guess, problem)
         return root._replace(x=root.x._replace(xi=free_components(root.x.xi, kind.free)))
 
     def whole(x: ArmUnknown, problem: ArmProblem) -> ArmUnknown:
         return x._replace(xi=completed(x.xi, problem.sections.rest, kind.free))
 
-    def imbalance(x: ArmUnknown, problem: ArmProblem) -> ArmImbalance:
+    def imbalance(x: ArmUnknown, problem: ArmProblem, _: ArmUnknown | None) -> ArmImbalance:
         unknown = whole(x, problem)
         return imbalance_of(unknown, state_of(unknown, problem, kind), problem, kind)
 
-    def linear_solve(x: ArmUnknown, problem: ArmProblem, right: ArmImbalance) -> ArmUnknown:
-        _, apply = jax.linearize(lambda x: imbalance(x, problem), x)
+    def linear_solve(
+        x: ArmUnknown, problem: ArmProblem, guess: ArmUnknown | None, right: ArmImbalance
+    ) -> ArmUnknown:
+        _, apply = jax.linearize(lambda x: imbalance(x, problem, guess), x)
         return tangent_solve(apply, whole(x, problem), problem, right, kind)
 
-    def at_rest(x: ArmUnknown, problem: ArmProblem) -> tuple[ArmUnknown, ArmProblem]:
+    def at_rest(x: ArmUnknown, problem: ArmProblem, guess: ArmUnknown | None) -> tuple:
         zero = jax.tree.map(jnp.zeros_like, x)
         rest = free_components(problem.sections.rest, kind.free)
-        return zero._replace(xi=rest), problem.at_rest()
+        return zero._replace(xi=rest), problem.at_rest(), guess
 
-    root = implicit_root(find, imbalance, linear_solve, at_rest, problem)
+    root = implicit_root(find, imbalance, linear_solve, at_rest, problem, guess)
     return root._replace(x=whole(root.x, problem))
 
 
@@ -84,7 +88,7 @@ def _start(problem: ArmProblem, kind: Kind) -> ArmUnknown:
     xi = tuple(
         jnp.where(sound, x.astype(x0.dtype), x0) for x, x0 in zip(alone.xi, rest, strict=True)
     )
-    xi = with_locked(xi, rest, kind.free)  # the iteration does not change these
+    xi = with_locked(xi, rest, kind.free)
     return ArmUnknown(xi, tension, (jnp.zeros_like(xi[0]),) * len(kind.frictional))
 
 
@@ -152,10 +156,11 @@ class _Sizes(NamedTuple):
         return jnp.max(jnp.abs(x), axis=self._inner(x))
 
 
-def _solve(kind: Kind, start: ArmUnknown, whole: ArmProblem) -> Root:
-    arms = arms_in((start, whole), whole.grid.h.ndim - 1)
-    start = jax.tree.map(
-        lambda x: jnp.broadcast_to(x, (*x.shape[: x.ndim - len(arms)], *arms)), start
+def _solve(kind: Kind, origin: ArmUnknown, guess: ArmUnknown | None, whole: ArmProblem) -> Root:
+    arms = arms_in((origin, guess, whole), whole.grid.h.ndim - 1)
+    start, origin = jax.tree.map(
+        lambda x: jnp.broadcast_to(x, (*x.shape[: x.ndim - len(arms)], *arms)),
+        (origin if guess is None else guess, origin),
     )
     sizes = _Sizes(whole.grid, whole.sections, kind, arms)
 
@@ -173,6 +178,6 @@ def _solve(kind: Kind, start: ArmUnknown, whole: ArmProblem) -> Root:
         )
 
     shares = 1 if whole.loads is None else LOAD_INCREMENTS
-    return damped_newton(
-        evaluate, sizes.work, start, jnp.broadcast_to(rounding_of(whole), arms), shares
-    )
+    floor = jnp.broadcast_to(rounding_of(whole), arms)
+    again = None if guess is None else origin
+    return damped_newton(evaluate, sizes.work, start, floor, shares, again)

@@ -9,7 +9,6 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..arm.actuator import Tendon
 from ..arm.scene import CrossSections, Scene
 from ..numerics import component as c
 from ..numerics.component import Vector
@@ -51,10 +50,9 @@ def cable_of(
     scene: Scene, change: Scalar, place: int, sections: CrossSections, grid: Grid
 ) -> Cable:
     """The cable of a tendon with prescribed length, for a change of its length [m]."""
-    tendon = scene.actuators[place]
-    assert isinstance(tendon, Tendon)
+    stiffness = scene.actuators[place].cable_stiffness
     length = path_length(sections.rest, sections, place, grid) + change
-    compliance = None if tendon.stiffness is None else 1 / tendon.stiffness
+    compliance = None if stiffness is None else 1 / stiffness
     scale = largest_force_scale(sections.stiffness) / scene.rod.length
     return Cable(length, compliance, scale)
 

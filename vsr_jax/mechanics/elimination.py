@@ -153,17 +153,10 @@ def _cells(
 ) -> tuple[EliminationCell, EliminatedLinear, Array]:
     """All that does not depend on P, for all nodes at once, and whether each section is stable by
     itself."""
-    half, density = 0.5 * w, loads.follower_density
-    m, n, u = c.skew(wrench[:3]), c.skew(wrench[3:]), c.skew(xi[3:])
-    moment, by_force, force = c.matmul(n, u), n, None  # changes per rotation, without those from P
-    if density is not None:
-        force = c.scale(-half, c.skew(density[3:]))
-        moment, by_force = (
-            c.subtract(c.add(moment, c.matmul(u, force)), c.skew(density[:3])),
-            c.add(n, force),
-        )
+    half, n = 0.5 * w, c.skew(wrench[3:])
+    moment, by_force, force = _per_rotation(n, c.skew(xi[3:]), loads, half)
     moment = c.keep(c.scale(half, moment), xi[0])
-    by_theta, H = c.add(moment, m), c.symmetric(lower)
+    by_theta, H = c.add(moment, c.skew(wrench[:3])), c.symmetric(lower)
     flexibility, rigid = _inverse(
         tuple(row[3:] for row in H[3:]), tuple(i - 3 for i in free if i > 2)
     )
@@ -201,6 +194,20 @@ def _cells(
         by_push, stretch = c.scale(-1.0, c.matmul(compliance, D)), c.matmul(lever, flexibility)
         cell = cell._replace(by_push=by_push, stretch=stretch, axis=xi[3:], force=force)
     return cell, EliminatedLinear(flexibility, by_force, right[3:], by_bend), rigid & stable
+
+
+def _per_rotation(
+    n: Matrix, u: Matrix, loads: Loading, half: Array
+) -> tuple[Matrix, Matrix, Matrix | None]:
+    """Derivatives by the rotation of a section, without those through P: of the change of the
+    moment per length, of the force, and of the change of the force over half a cell, which is None
+    without follower density."""
+    density = loads.follower_density
+    if density is None:
+        return c.matmul(n, u), n, None
+    force = c.scale(-half, c.skew(density[3:]))
+    moment = c.add(c.matmul(n, u), c.matmul(u, force))
+    return c.subtract(moment, c.skew(density[:3])), c.add(n, force), force
 
 
 def _inverse(matrix: Matrix, places: tuple[int, ...]) -> tuple[Matrix, Array]:

@@ -22,7 +22,7 @@ from jaxtyping import Array
 from ..arm.scene import Scene
 from ..numerics import component as c
 from ..numerics.component import Matrix, Vector
-from ..numerics.magnus import magnus_6, step_components
+from ..numerics.magnus import magnus_6
 from ..numerics.quadrature import (
     Grid,
     beyond,
@@ -133,37 +133,41 @@ def partial_rotation(k: Vector, h: Array, sigma: Array | float) -> Vector:
     r"""Rotation vector from the start of a step to the fraction $\sigma$ of it, from the angular
     strain at its nodes.
 
-    The Magnus expansion of the polynomial through the nodes, $k = b_0 + b_1 \sigma + b_2 \sigma^2$,
-    to the order of the steps. Rotations at the nodes need that order too: with the first
-    commutators alone the error at the tip of a loaded arm is of order 4.5 instead of 6.
+    The Magnus expansion of the polynomial through the nodes, $k = b_0 + b_1 x + b_2 x^2$ with x
+    from -1/2 to 1/2 on the step, to the order of the steps. About the middle of the step the
+    coefficients are small sums of differences, so that single precision keeps its digits. Rotations
+    at the nodes need that order too: with the first commutators alone the error at the tip of a
+    loaded arm is of order 4.5 instead of 6.
     """
     stages = k[0].shape[0]
-    b = [tuple(weighted(row, x) for x in k) for row in interpolation(stages)]
-    h = h * sigma
+    near = tuple(x[stages // 2] for x in k)  # differences from it are exact, or nearly
+    through = [weighted(interpolation(stages, 0.5), x - x0) for x, x0 in zip(k, near, strict=True)]
+    b = [tuple(x[power] for x in through) for power in range(stages)]
+    b[0] = c.add(near, b[0])
+    h, middle = h * sigma, 0.5 * (sigma - 1.0)
     if stages == 1:
         return c.scale(h, b[0])
-    slope = c.scale(sigma, b[1])
     if stages == 2:
-        mean = c.scale(h, c.add(b[0], c.scale(0.5, slope)))
-        return c.add(mean, c.scale(h / 12, c.cross(mean, slope)))
-    bend = c.scale(sigma * sigma, b[2])
-    mean = c.scale(h, c.add(b[0], c.add(c.scale(0.5, slope), c.scale(0.25, bend))))
-    return magnus_6(mean, c.scale(h, c.add(slope, bend)), c.scale(h, bend), c.cross)
+        mean = c.scale(h, c.add(b[0], c.scale(middle, b[1])))
+        return c.add(mean, c.scale(h * sigma / 12, c.cross(mean, b[1])))
+    bend = c.scale(middle, b[2])
+    mean = c.scale(h, c.add(b[0], c.scale(middle, c.add(b[1], bend))))
+    slope = c.scale(h * sigma, c.add(b[1], c.scale(2.0, bend)))
+    return magnus_6(mean, slope, c.scale(h * sigma * sigma, b[2]), c.cross)
 
 
 def rotations(k: Vector, h: Array, base: Array | None) -> tuple[Matrix, Matrix, Matrix]:
     """Rotation at the start of every step, at the nodes and at the end of the arm, from the angular
     strain at the nodes."""
-    stages = k[0].shape[0]
-    zero = jnp.zeros_like(k[0])  # the angular part of a step needs no linear strain
-    omega = step_components(
-        tuple((*(x[i] for x in k), zero[i], zero[i], zero[i]) for i in range(stages)), h
-    )[:3]
+    # within each step up to its nodes, and up to its end
+    parts = jnp.append(jnp.asarray(gauss_legendre(k[0].shape[0])[0], h.dtype), 1.0)
+    within_step = rotation_components(partial_rotation(k, h, parts.reshape(-1, *(1,) * h.ndim)))
+    whole = jax.tree.map(lambda x: x[-1], within_step)
+    to_nodes = jax.tree.map(lambda x: x[:-1], within_step)
     matrix = base_pose(base, h.dtype)[:3, :3]
-    first = tuple(tuple(jnp.broadcast_to(x, zero[0, 0].shape) for x in row) for row in matrix)
-    end, starts = lax.scan(lambda R, E: (c.matmul(R, E), R), first, rotation_components(omega))
-    nodes = jnp.asarray(gauss_legendre(stages)[0], h.dtype).reshape(-1, *(1,) * h.ndim)
-    return starts, c.matmul(starts, rotation_components(partial_rotation(k, h, nodes))), end
+    first = tuple(tuple(jnp.broadcast_to(x, whole[0][0][0].shape) for x in row) for row in matrix)
+    end, starts = lax.scan(lambda R, E: (c.matmul(R, E), R), first, whole)
+    return starts, c.matmul(starts, to_nodes), end
 
 
 def react(xi: Vector, grid: Grid, loads: Loading) -> Reaction:

@@ -37,7 +37,7 @@ from .balance import residual
 
 COARSE = 0.1
 """Estimated error of the tip, as a fraction of the arm's length, above which a shape is
-under-resolved."""
+under-resolved: the series behind the estimate then say little of its true size."""
 
 _TAPER = 0.7
 """Decrease of the weight from base to tip; below 1, so that the angle of the tip still counts."""

@@ -3,7 +3,7 @@
 They use scenes and mechanics, and are independent of what is done with the result.
 """
 
-from .base import Model, Nodes, Outcome, Status, SteppedModel, classify
+from .base import Model, Near, Nodes, Outcome, Status, SteppedModel, classify
 from .basis import (
     AbstractBasis,
     Basis,
@@ -16,6 +16,7 @@ from .basis import (
     Trigonometric,
 )
 from .prescribed import Prescribed, actuation_matrix, jacobian, project, stiffness_matrix
+from .refinement import Refinement
 from .strain_dependent import StrainDependent
 
 __all__ = [
@@ -27,10 +28,12 @@ __all__ = [
     "Legendre",
     "Model",
     "Monomial",
+    "Near",
     "Nodes",
     "Outcome",
     "PiecewiseConstant",
     "Prescribed",
+    "Refinement",
     "Status",
     "SteppedModel",
     "StrainDependent",

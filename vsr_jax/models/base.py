@@ -20,6 +20,8 @@ from ..numerics.magnus import step_components, step_poses, tip_pose
 from ..numerics.quadrature import Grid, gauss_legendre, locate, make_grid
 from ..numerics.se3 import exp_components, pose
 from ..typing import Pose, Scalar
+from .basis import unnamed
+from .refinement import Refinement, balanced_strain, corrected_strain, merged_tip
 
 
 class Status(IntEnum):
@@ -57,6 +59,10 @@ _MESSAGES = {
 _NOTHING = 1e-4
 """Fraction of its rest length below which a path counts as collapsed."""
 
+_UNSETTLED = 4
+"""Factor by which the ratio of the errors of steps and of steps twice as long may differ from that
+of their order, since a few steps are not yet in the asymptotic regime."""
+
 
 class Nodes(NamedTuple):
     """A grid and, at its nodes, the strain, the cross-sections and the share of each thread's force
@@ -82,6 +88,16 @@ class Outcome(NamedTuple):
     steps: Array
 
 
+class Near(NamedTuple):
+    """A solution of a scene near by, from which a solve may start: its model, its scene, and the
+    thread forces and the state of its `Outcome`."""
+
+    model: "Model"
+    scene: Scene
+    forces: Forces
+    state: Any
+
+
 class Model(eqx.Module):
     """A method to compute and describe the equilibrium of a scene.
 
@@ -95,6 +111,10 @@ class Model(eqx.Module):
     @abstractmethod
     def solve(self, scene: Scene, inputs: Float[Array, " inputs"]) -> Outcome:
         """Equilibrium for admissible inputs."""
+
+    def solve_from(self, scene: Scene, inputs: Float[Array, " inputs"], near: Near) -> Outcome:
+        """As `solve`, started from a solution near by; a model without a use for it ignores it."""
+        return self.solve(scene, inputs)
 
     @abstractmethod
     def strain(
@@ -130,6 +150,34 @@ class Model(eqx.Module):
     def finer(self) -> "Model":
         """The same model with twice the steps, or with tighter tolerances if the steps are
         adaptive."""
+
+    def strain_on(self, scene: Scene, forces: Forces, state: Any, grid: Grid) -> Vector:
+        """Strain at the nodes of a grid, a first guess of another solution there."""
+        xi = self.strain(scene, forces, state, grid.X.reshape(-1))
+        return tuple(x.reshape(grid.X.shape) for x in xi)
+
+    def turning(self, scene: Scene, state: Any, grid: Grid) -> Vector:
+        """Turning rates [rad/m] of the tendons with friction at the nodes of a grid, a first guess
+        of another solution there; zero by default."""
+        return (jnp.zeros_like(grid.X),) * len(scene.frictional)
+
+    def dof_labels(self, size: int) -> tuple[tuple[str, str], ...] | None:
+        """Name and unit of each of the `size` coordinates; None where they are the forces of the
+        threads."""
+        return unnamed(size)
+
+    def refined(self, scene: Scene, inputs: Array, forces: Forces, state: Any) -> Refinement:
+        """A better solution than the given one, from which its error is estimated; by default the
+        solution of the `finer` model."""
+        grid, finer = make_grid(scene.edges(), 32, 3), self.finer()
+        found, X = finer.solve(scene, inputs), grid.X.reshape(-1)
+        return Refinement(
+            finer.tip(scene, found.forces, found.state),
+            X,
+            self.strain(scene, forces, state, X),
+            finer.strain(scene, found.forces, found.state, X),
+            1.0,
+        )
 
     def step_error(self, scene: Scene, forces: Forces, state: Any) -> Scalar | None:
         """Rough estimate of the tip's error by the steps, as a fraction of the arm's length; None
@@ -167,6 +215,22 @@ class SteppedModel(Model):
     @abstractmethod
     def node_strain(self, scene: Scene, state: Any) -> Vector:
         """Strain at the nodes of `grid`, six component arrays of shape (stages, steps)."""
+
+    def refined(self, scene: Scene, inputs: Array, forces: Forces, state: Any) -> Refinement:
+        smooth = not scene.coupled and scene.edges().size == 2
+        if self.balanced_everywhere and smooth and self.steps > 1:
+            grid, xi = self.grid(scene), self.node_strain(scene, state)
+            error = (self.steps / (self.steps // 2 * 2)) / (2**self.order - 1)
+            tip = merged_tip(xi, grid, scene.rod.base)
+            return Refinement(tip, grid.X, xi, xi, _UNSETTLED * error)
+        grid = make_grid(scene.edges(self.breakpoints(scene)), 2 * self.steps, 3)
+        xi = better = self.strain_on(scene, forces, state, grid)
+        if scene.coupled:
+            turning = self.turning(scene, state, grid)
+            better = corrected_strain(scene, inputs, forces, xi, turning, grid)
+        elif not self.balanced_everywhere:
+            better = balanced_strain(scene, forces, xi, grid)
+        return Refinement(tip_pose(better, grid.h, scene.rod.base), grid.X, xi, better, 1.0)
 
     def poses(
         self, scene: Scene, forces: Forces, state: Any, X: Float[Array, " stations"]

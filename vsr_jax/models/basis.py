@@ -15,8 +15,14 @@ from jaxtyping import Array, Float
 
 from ..arm.profile import FunctionOfX
 from ..arm.rod import STRAINS
-from ..typing import Scalar
+from ..arm.scene import Scene
+from ..typing import Scalar, VectorLike
 from ..validation import concrete, count, instance, numbers
+
+
+def unnamed(size: int) -> tuple[tuple[str, str], ...]:
+    """Name and unit of coordinates of which nothing is known."""
+    return tuple((f"q_{i}", "unknown") for i in range(size))
 
 
 class Family(eqx.Module):
@@ -92,14 +98,24 @@ class Trigonometric(Family):
     cosine: bool = eqx.field(static=True)
 
     def __init__(
-        self, frequencies: Any, *, constant: bool = True, sine: bool = True, cosine: bool = True
+        self,
+        frequencies: VectorLike,
+        *,
+        constant: bool = True,
+        sine: bool = True,
+        cosine: bool = True,
     ):
         self.frequencies = jnp.atleast_1d(numbers("Trigonometric.frequencies", frequencies, None))
         self.constant, self.sine, self.cosine = bool(constant), bool(sine), bool(cosine)
-        if self.frequencies.ndim != 1 or self.size == 0:
+        if self.frequencies.ndim != 1:
             raise ValueError(
-                "Trigonometric: got no function, need at least one of constant, sine, cosine and "
-                "frequencies in a row"
+                f"Trigonometric.frequencies: got shape {self.frequencies.shape}, need one number "
+                f"or a list of numbers"
+            )
+        if self.size == 0:
+            raise ValueError(
+                "Trigonometric: got no function, need at least one of constant, sine and cosine, "
+                "and frequencies for the last two"
             )
 
     @property
@@ -124,8 +140,8 @@ class PiecewiseConstant(Family):
 
     ends: Float[Array, " inner"]
 
-    def __init__(self, sections: Any):
-        if isinstance(sections, int):
+    def __init__(self, sections: VectorLike):
+        if isinstance(sections, int | np.integer):
             sections = np.arange(1, count("PiecewiseConstant.sections", sections)) / sections
         self.ends = numbers("PiecewiseConstant.sections", sections, None)
         known = concrete(self.ends)
@@ -165,7 +181,7 @@ class Functions(Family):
         return self._size
 
     def __call__(self, X: Scalar, length: Scalar) -> Float[Array, " size"]:
-        return self.function(X)
+        return _of_shape("Functions", self.function(X), (self.size,), X)
 
 
 class AbstractBasis(eqx.Module):
@@ -185,9 +201,26 @@ class AbstractBasis(eqx.Module):
         """Names of the strains that it frees."""
         return STRAINS
 
+    @property
+    def labels(self) -> tuple[tuple[str, str], ...]:
+        """Name and unit of each coordinate."""
+        return unnamed(self.size)
+
     def breakpoints(self, length: Scalar) -> tuple[Scalar, ...]:
         """Abscissas [m] where the basis or its derivative jumps."""
         return ()
+
+    def check(self, scene: Scene, owner: str) -> None:
+        """Raises `ValueError` if the basis frees a strain that the scene locks.
+
+        **Arguments:** `owner`: name of the model, for the message.
+        """
+        locked = [name for name in self.strains if name not in scene.free_strains]
+        if locked:
+            raise ValueError(
+                f"{owner}.basis: got one that frees {', '.join(locked)}, need only "
+                f"{', '.join(scene.free_strains)}, as the scene"
+            )
 
 
 class Basis(AbstractBasis):
@@ -200,6 +233,7 @@ class Basis(AbstractBasis):
     """
 
     families: dict[str, Family]
+    _distinct: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(self, families: Mapping[str, Family]):
         for name, family in families.items():
@@ -216,10 +250,24 @@ class Basis(AbstractBasis):
         if not families:
             raise ValueError("Basis: got no strain, need at least one")
         self.families = dict(families)
+        # a family that several strains share breaks the steps once; copies of it are not the same
+        first: dict[int, str] = {}
+        for name, family in self.families.items():
+            first.setdefault(id(family), name)
+        self._distinct = tuple(first.values())
 
     @property
     def strains(self) -> tuple[str, ...]:
         return tuple(self.families)
+
+    @property
+    def labels(self) -> tuple[tuple[str, str], ...]:
+        return tuple(
+            (f"{name}_{i}", "1/m" if place < 3 else "1")
+            for place, name in enumerate(STRAINS)
+            if name in self.families
+            for i in range(self.families[name].size)
+        )
 
     @classmethod
     def uniform(cls, family: Family, strains: tuple[str, ...] = STRAINS) -> "Basis":
@@ -239,8 +287,8 @@ class Basis(AbstractBasis):
         return jnp.concatenate(blocks, axis=1)
 
     def breakpoints(self, length: Scalar) -> tuple[Scalar, ...]:
-        distinct = {id(family): family for family in self.families.values()}
-        return tuple(x for family in distinct.values() for x in family.breakpoints(length))
+        distinct = (self.families[name] for name in self._distinct)
+        return tuple(x for family in distinct for x in family.breakpoints(length))
 
 
 class FunctionBasis(AbstractBasis):
@@ -258,4 +306,11 @@ class FunctionBasis(AbstractBasis):
         return self._size
 
     def matrix(self, X: Scalar, length: Scalar) -> Float[Array, "6 dofs"]:
-        return self.function(X)
+        return _of_shape("FunctionBasis", self.function(X), (6, self.size), X)
+
+
+def _of_shape(owner: str, value: Any, shape: tuple[int, ...], X: Scalar) -> Array:
+    array = jnp.asarray(value, X.dtype)
+    if array.shape != shape:
+        raise ValueError(f"{owner}.function: got values of shape {array.shape}, need {shape}")
+    return array

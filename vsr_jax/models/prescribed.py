@@ -1,11 +1,13 @@
 r"""The model with a prescribed basis (eq. 14-18): $K q = B(q) \tau$ by Gauss quadrature and
 Newton's method."""
 
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..arm.scene import CrossSections, Scene
@@ -142,7 +144,7 @@ class Prescribed(SteppedModel):
         return self.basis.breakpoints(scene.rod.length)
 
     def solve(self, scene: Scene, inputs: Float[Array, " inputs"]) -> Outcome:
-        self._check_strains(scene)
+        self.basis.check(scene, type(self).__name__)
         if scene.coupled:
             return self._solve_together(scene, inputs)
         projection, forces = project(scene, self.basis, self.points), scene.forces(inputs)
@@ -156,9 +158,12 @@ class Prescribed(SteppedModel):
         basis = self._at_nodes(scene, problem.grid)
         (q, tensions), balanced, definite, steps = solve_prescribed(basis, problem, kind)
         forces = with_tensions(problem.forces, tensions, kind)
-        xi = prescribed_loaded.strain(q, basis, problem)
-        tau = problem.sections.carry(forces)
-        status = classify(xi, problem.sections, tau, balanced, definite, loaded=bool(scene.loads))
+        at = prescribed_loaded.state_of(
+            prescribed_loaded.GalerkinUnknown(q, tensions), basis, problem, kind
+        )
+        status = classify(
+            at.xi, problem.sections, at.tau, balanced, definite, loaded=bool(scene.loads)
+        )
         sound = status == Status.CONVERGED
         return Outcome(jnp.where(sound, q, 0.0), forces_where(sound, forces), status, steps)
 
@@ -177,20 +182,17 @@ class Prescribed(SteppedModel):
             matrix.reshape(shape), None if rate is None else rate.reshape(shape)
         )
 
-    def _check_strains(self, scene: Scene) -> None:
-        freed = self.basis.strains
-        locked = [name for name in freed if name not in scene.free_strains]
-        if locked:
-            raise ValueError(
-                f"Prescribed.basis: got one that frees {', '.join(locked)}, need only "
-                f"{', '.join(scene.free_strains)}, as the scene"
-            )
-
     def coordinates(self, scene: Scene, forces: Forces, state: Array) -> Float[Array, " dofs"]:
         return state
 
+    def finer(self) -> "Prescribed":
+        return replace(self, steps=2 * self.steps, points=2 * self.points)
+
     def dofs(self, scene: Scene) -> int:
         return self.basis.size
+
+    def dof_labels(self, size: int) -> tuple[tuple[str, str], ...]:
+        return self.basis.labels
 
     def node_strain(self, scene: Scene, state: Array) -> Vector:
         X = self.grid(scene).X
@@ -255,14 +257,14 @@ def actuation_matrix(
         columns.append(
             projection.integrate(c.scale(share, thread_wrench(thread_direction(xi, path)[0], path)))
         )
-    return jnp.stack(columns, axis=1)
+    return jnp.stack(columns, axis=1) if columns else jnp.zeros((q.size, 0), q.dtype)
 
 
 def jacobian(
     scene: Scene,
     basis: AbstractBasis,
     q: Float[Array, " dofs"],
-    X: Any = None,
+    X: ArrayLike | None = None,
     *,
     steps: int = 32,
     order: int = 6,

@@ -239,7 +239,7 @@ def solve_prescribed(basis: NodalBasis, problem: ArmProblem, kind: Kind) -> Root
     """
 
     def row(unknown: GalerkinUnknown, basis: NodalBasis, problem: ArmProblem) -> Array:
-        """Residual in a row."""
+        """Residual as one vector."""
         return jnp.concatenate(
             imbalance(unknown, state_of(unknown, basis, problem, kind), basis, problem)
         )

@@ -7,10 +7,12 @@ becomes
 $$\xi' = (\Sigma - A)^{-1} (\Lambda' - \partial r / \partial X + B_\tau \tau'), \quad
 g' = g \hat\xi,$$
 
-with $\Lambda = r(\xi)$. The rotation is known at the base and the reaction at the tip. Single
-shooting over a long soft arm is ill-conditioned, so the arm is divided into segments, also at its
-breakpoints. The unknowns are the rotation and the reaction at the start of each segment, continuous
-except for point loads. The initial guess is a solution on steps.
+starting from $\Lambda = r(\xi)$. All three are integrated: the reaction that follows from the
+strain of a slender arm would be the small difference of large numbers. The rotation is known at the
+base and the reaction at the tip. Single shooting over a long soft arm is ill-conditioned, so the
+arm is divided into segments, also at its breakpoints. The unknowns are the rotation and the
+reaction at the start of each segment, continuous except for point loads. The initial guess is a
+solution on steps.
 """
 
 from typing import Any, NamedTuple
@@ -23,7 +25,7 @@ from jaxtyping import Array
 
 from ..arm.scene import CrossSections, Scene, shared
 from ..mechanics.arm_balance import shares_at
-from ..mechanics.balance import residual, solve_balance
+from ..mechanics.balance import solve_balance
 from ..mechanics.friction import balanced_strain_rate, reaction_rate
 from ..numerics import component as c
 from ..numerics.component import Forces, Vector
@@ -33,9 +35,13 @@ from ..numerics.se3 import base_pose, hat, rotation_components, unskew
 _SHOTS = 12
 """Bound on the Newton steps of the shooting; from a solution on steps they converge
 quadratically."""
-_INSIDE = 1e-10
-"""Distance from the ends of a segment, as a fraction of it, at which it is evaluated there: at a
-jump the values are those inside the segment."""
+
+
+def _inside(dtype: Any) -> float:
+    """Distance from the ends of a segment, as a fraction of it, at which it is evaluated there: at
+    a jump the values are those inside the segment. Rounding of an abscissa is smaller, on segments
+    down to a hundredth of the arm."""
+    return max(1e-10, 800 * float(jnp.finfo(dtype).eps))
 
 
 class Guess(NamedTuple):
@@ -55,11 +61,13 @@ class ShootingUnknown(NamedTuple):
     reaction: Array
 
 
-class Line(NamedTuple):
-    """State integrated over a segment: the strain, and the pose relative to the start."""
+class SegmentState(NamedTuple):
+    """State integrated over a segment: the strain, the pose relative to the start, and the
+    reaction in units of `wrench_scale`."""
 
     xi: Array
     g: Array
+    wrench: Array
 
 
 class Control(NamedTuple):
@@ -92,27 +100,28 @@ def integrate(
     rotation: Array,
     reaction: Array,
     part: Array,
-) -> tuple[Line, Array, Array]:
-    """Strain and pose relative to the start of a segment at a fraction `part` of it, whether
-    diffrax succeeded, and its steps."""
-    free = scene.free
+    unit: Array,
+) -> tuple[SegmentState, Array, Array]:
+    """State at a fraction `part` of a segment, whether diffrax succeeded, and its steps; reactions
+    are measured in `unit`, their scale."""
+    free, inside = scene.free, _inside(h.dtype)
 
     def at(t: Array) -> tuple[Array, CrossSections, Vector]:
-        x = start + h * (_INSIDE + (1 - 2 * _INSIDE) * t)
+        x = start + h * (inside + (1 - 2 * inside) * t)
         shares = shares_at(scene, guess.xi, guess.turning, guess.grid, x)
         return x, scene.sections(x), shared(guess.forces, shares)
 
-    def field(t: Any, line: Line, _: None) -> Line:
+    def field(t: Any, line: SegmentState, _: None) -> SegmentState:
         (x, sections, tau), rate = jax.jvp(at, (jnp.asarray(t, h.dtype),), (jnp.ones((), h.dtype),))
         per_length = jnp.where(h > 0, h, 1.0)
         rate = jax.tree.map(lambda v: v / per_length, rate)
         xi = c.split(line.xi)
-        wrench = residual(xi, sections, tau)
         density = _body_density(scene, x, rotation @ line.g[:3, :3])
-        xi_rate = balanced_strain_rate(
-            xi, tau, rate[2], reaction_rate(xi, wrench, density), sections, rate[1], free
+        change = reaction_rate(xi, c.split(unit * line.wrench), density)
+        xi_rate = balanced_strain_rate(xi, tau, rate[2], change, sections, rate[1], free)
+        return SegmentState(
+            h * c.join(xi_rate), h * (line.g @ hat(line.xi)), h * c.join(change) / unit
         )
-        return Line(h * c.join(xi_rate), h * (line.g @ hat(line.xi)))
 
     _, sections, tau = at(jnp.zeros_like(h))
     xi = c.join(solve_balance(sections, tau, c.split(reaction), free).xi)
@@ -120,9 +129,9 @@ def integrate(
         diffrax.ODETerm(field),
         control.solver,
         t0=jnp.zeros_like(h),
-        t1=jnp.maximum(part, _INSIDE),
+        t1=jnp.maximum(part, inside),
         dt0=None,
-        y0=Line(xi, jnp.eye(4, dtype=h.dtype)),
+        y0=SegmentState(xi, jnp.eye(4, dtype=h.dtype), reaction / unit),
         saveat=diffrax.SaveAt(t1=True),
         stepsize_controller=diffrax.PIDController(rtol=control.rtol, atol=control.atol),
         max_steps=control.max_steps,
@@ -131,7 +140,8 @@ def integrate(
     )
     assert solution.ys is not None
     line = jax.tree.map(lambda y: y[0], solution.ys)
-    return line, solution.result == diffrax.RESULTS.successful, solution.stats["num_steps"]
+    completed = solution.result == diffrax.RESULTS.successful
+    return line, completed, solution.stats["num_steps"].astype(jnp.int32)
 
 
 def _body_density(scene: Scene, X: Array, rotation: Array) -> Vector:
@@ -150,6 +160,55 @@ def _body_density(scene: Scene, X: Array, rotation: Array) -> Vector:
     return total if follower is None else c.add(total, follower)
 
 
+class _Matching(NamedTuple):
+    """The equations of the shooting: z holds for each segment the rotation vector by which its
+    start is turned from the first guess, and the change of its reaction."""
+
+    scene: Scene
+    guess: Guess
+    first: ShootingUnknown
+    segments: Grid
+    control: Control
+    unit: Array
+
+    def unknown(self, z: Array) -> ShootingUnknown:
+        return ShootingUnknown(
+            jax.vmap(_turned)(self.first.rotation, z[:, :3]), self.first.reaction + z[:, 3:]
+        )
+
+    def misfit(self, z: Array, ends: Array) -> Array:
+        """In rad, and in units of the reaction."""
+        off = _misfit(self.scene, self.unknown(z), ends, self.segments)
+        return off / jnp.concatenate([jnp.ones_like(self.unit[:3]), self.unit])
+
+    def ends(self, z: Array) -> tuple[Array, Array, tuple]:
+        """Reaction and rotation at the end of each segment, their derivatives by the segment's row
+        of z, and of each segment the relative pose, whether diffrax succeeded, and its steps."""
+
+        def one(*row: Array) -> tuple[Array, tuple]:
+            end, found = self._end(*row)
+            return end, (end, found)
+
+        rows = z, self.first.rotation, self.first.reaction, self.segments.start, self.segments.h
+        slopes, (ends, found) = jax.vmap(jax.jacfwd(one, has_aux=True))(*rows)
+        return ends, slopes, found
+
+    def _end(
+        self, row: Array, R: Array, first: Array, start: Array, h: Array
+    ) -> tuple[Array, tuple]:
+        rotation, reaction = _turned(R, row[:3]), first + row[3:]
+        scene, guess, control, all_of_it = self.scene, self.guess, self.control, jnp.ones_like(h)
+        line, done, steps = integrate(
+            scene, guess, control, start, h, rotation, reaction, all_of_it, self.unit
+        )
+        turned = (rotation @ line.g[:3, :3]).reshape(-1)
+        return jnp.concatenate([self.unit * line.wrench, turned]), (line.g, done, steps)
+
+
+def _turned(R: Array, k: Array) -> Array:
+    return R @ c.join_matrix(rotation_components(c.split(k)))
+
+
 def shoot(
     scene: Scene,
     guess: Guess,
@@ -159,85 +218,58 @@ def shoot(
     tolerance: float,
 ) -> Shot:
     """Rotations and reactions at the start of the segments for which neighbours match."""
+    number, unit = segments.h.size, wrench_scale(scene, first.reaction)
+    match = _Matching(scene, guess, first, segments, control, unit)
 
-    def over(start: Array, h: Array, rotation: Array, reaction: Array) -> tuple[Array, tuple]:
-        """Reaction and rotation at the end, as one array."""
-        line, done, steps = integrate(
-            scene, guess, control, start, h, rotation, reaction, jnp.ones_like(h)
-        )
-        x = start + h * (1 - _INSIDE)
-        tau = shared(guess.forces, shares_at(scene, guess.xi, guess.turning, guess.grid, x))
-        wrench = c.join(residual(c.split(line.xi), scene.sections(x), tau))
-        return jnp.concatenate([wrench, (rotation @ line.g[:3, :3]).reshape(-1)]), (
-            line.g,
-            done,
-            steps,
-        )
+    def step(at: _Iterate) -> _Iterate:
+        z = at.following
+        ends, slopes, (g, done, steps) = match.ends(z)
+        linear = jax.jacfwd(
+            lambda moved: match.misfit(moved, ends + jnp.einsum("sij,sj->si", slopes, moved - z))
+        )(z)
+        off = match.misfit(z, ends)
+        dz = jnp.linalg.solve(linear.reshape(z.size, z.size), off.reshape(-1)).reshape(z.shape)
+        size = jnp.max(jnp.abs(off))
+        return _Iterate(z, z - dz, size, at.misfit, at.taken + 1, jnp.all(done), jnp.max(steps), g)
 
-    count = segments.h.size
-    scale = _scale(scene, first, count)
+    def proceed(at: _Iterate) -> Array:
+        # the step after the first that fits is taken too: it squares the misfit
+        return (at.taken < _SHOTS) & (at.before > tolerance)
 
-    def turned(R: Array, k: Array) -> Array:
-        return R @ c.join_matrix(rotation_components(c.split(k)))
-
-    def place(z: Array) -> ShootingUnknown:
-        return ShootingUnknown(
-            jax.vmap(turned)(first.rotation, z[:, :3]), first.reaction + z[:, 3:]
-        )
-
-    def misfit(z: Array, ends: Array) -> Array:
-        return _misfit(scene, place(z), ends, segments) / scale
-
-    def step(carry: tuple) -> tuple:
-        z, _, taken, _, _, _ = carry
-
-        def one(
-            z_row: Array, R: Array, reaction: Array, start: Array, h: Array
-        ) -> tuple[Array, tuple]:
-            end, aux = over(start, h, turned(R, z_row[:3]), reaction + z_row[3:])
-            return end, (end, aux)
-
-        rows = (z, first.rotation, first.reaction, segments.start, segments.h)
-        slopes, (ends, (g, done, steps)) = jax.vmap(jax.jacfwd(one, has_aux=True))(*rows)
-        linear = jax.jacfwd(lambda z_: misfit(z_, ends + jnp.einsum("sij,sj->si", slopes, z_ - z)))(
-            z
-        )
-        size = z.size
-        off = misfit(z, ends)
-        dz = jnp.linalg.solve(linear.reshape(size, size), off.reshape(size)).reshape(z.shape)
-        return z - dz, jnp.max(jnp.abs(off)), taken + 1, jnp.all(done), jnp.max(steps), g
-
-    def proceed(carry: tuple) -> Array:
-        return (carry[2] < _SHOTS) & (carry[1] > tolerance)
-
-    z0 = jnp.zeros((count, 9), segments.h.dtype)
-    start = (
-        z0,
-        jnp.asarray(jnp.inf, z0.dtype),
-        0,
-        jnp.array(True),
-        jnp.zeros((), int),
-        jnp.zeros((count, 4, 4), z0.dtype),
-    )
-    z, off, _, done, steps, g = lax.while_loop(proceed, step, start)
-    unknown = place(z)
-    base = jnp.eye(4, dtype=z.dtype).at[:3, :3].set(unknown.rotation[0])
-    last, starts = lax.scan(lambda pose, increment: (pose @ increment, pose), base, g)
-    return Shot(
-        segments, unknown, jnp.concatenate([starts, last[None]]), done & (off <= tolerance), steps
-    )
+    zero = jnp.zeros((number, 9), segments.h.dtype)
+    none, far = jnp.zeros((), jnp.int32), jnp.asarray(jnp.inf, zero.dtype)
+    poses = jnp.zeros((number, 4, 4), zero.dtype)
+    begin = _Iterate(zero, zero, far, far, none, jnp.array(False), none, poses)
+    found = lax.while_loop(proceed, step, begin)
+    unknown = match.unknown(found.z)
+    base = jnp.eye(4, dtype=zero.dtype).at[:3, :3].set(unknown.rotation[0])
+    last, starts = lax.scan(lambda pose, increment: (pose @ increment, pose), base, found.poses)
+    fits = found.done & (found.misfit <= tolerance)
+    return Shot(segments, unknown, jnp.concatenate([starts, last[None]]), fits, found.steps)
 
 
-def _scale(scene: Scene, first: ShootingUnknown, count: int) -> Array:
-    """Scales of the unknowns of each segment: 1 rad, and the reaction or, if larger, the wrench
+class _Iterate(NamedTuple):
+    """State of the shooting's Newton loop: a point and the one after it, the misfit at the point
+    and at the one before, the number of steps, and for the point whether all segments could be
+    integrated, the most steps that one took, and their relative poses."""
+
+    z: Array
+    following: Array
+    misfit: Array
+    before: Array
+    taken: Array
+    done: Array
+    steps: Array
+    poses: Array
+
+
+def wrench_scale(scene: Scene, reaction: Array) -> Array:
+    """Scale (6,) of reactions: the largest of `reaction` (segments, 6) or, if larger, the wrench
     that bends the arm by 1 rad."""
-    length = scene.rod.length
-    moment = jnp.max(jnp.stack(scene.rod.stiffness(0.5 * length)[:3])) / length
-    size = jnp.maximum(
-        jnp.max(jnp.abs(first.reaction), axis=0),
-        jnp.repeat(jnp.stack([moment, moment / length]), 3),
-    )
-    return jnp.broadcast_to(jnp.concatenate([jnp.ones_like(size[:3]), size]), (count, 9))
+    length, stiffness = scene.rod.length, jnp.stack(scene.rod.stiffness(0.5 * scene.rod.length))
+    moment = jnp.max(stiffness[:3]) / length
+    bending = jnp.repeat(jnp.stack([moment, moment / length]), 3)
+    return jnp.maximum(jnp.max(jnp.abs(reaction), axis=0), bending)
 
 
 def _misfit(scene: Scene, unknown: ShootingUnknown, ends: Array, segments: Grid) -> Array:

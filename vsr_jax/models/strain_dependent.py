@@ -11,14 +11,15 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..arm.scene import Scene, shared
-from ..mechanics.arm_balance import ArmUnknown, problem_of, shares_at, state_of, with_tensions
+from ..mechanics.arm_balance import ArmUnknown, carried_forces, problem_of, shares_at, with_tensions
 from ..mechanics.arm_solve import solve_arm
 from ..mechanics.balance import forces_where, newton_step, solve_balance, spread
 from ..mechanics.reaction import loading, react_at
 from ..numerics.component import Forces, Vector
 from ..numerics.magnus import ORDERS
+from ..numerics.quadrature import Grid
 from ..validation import choice, count
-from .base import Nodes, Outcome, Status, SteppedModel, classify, rest_where_failed
+from .base import Near, Nodes, Outcome, Status, SteppedModel, classify, rest_where_failed
 
 
 class StrainDependent(SteppedModel):
@@ -57,10 +58,22 @@ class StrainDependent(SteppedModel):
         state = ArmUnknown(rest_where_failed(status, solution.xi, sections), (), ())
         return Outcome(state, forces, status, solution.steps)
 
-    def _solve_together(self, scene: Scene, inputs: Float[Array, " inputs"]) -> Outcome:
+    def solve_from(self, scene: Scene, inputs: Float[Array, " inputs"], near: Near) -> Outcome:
+        if not scene.coupled:  # a few steps of each section alone, from anywhere
+            return self.solve(scene, inputs)
+        grid = self.grid(scene)
+        xi = near.model.strain_on(near.scene, near.forces, near.state, grid)
+        tension = tuple(-near.forces[place] for place in scene.length_driven)
+        turning = near.model.turning(near.scene, near.state, grid)
+        guess = lax.stop_gradient(ArmUnknown(xi, tension, turning))
+        return self._solve_together(scene, inputs, guess)
+
+    def _solve_together(
+        self, scene: Scene, inputs: Float[Array, " inputs"], guess: ArmUnknown | None = None
+    ) -> Outcome:
         problem, kind = problem_of(scene, inputs, self.grid(scene))
-        unknown, balanced, definite, steps = solve_arm(problem, kind)
-        tau = state_of(unknown, problem, kind).tau
+        unknown, balanced, definite, steps = solve_arm(problem, kind, guess)
+        tau = carried_forces(unknown, problem, kind)
         status = classify(
             unknown.xi, problem.sections, tau, balanced, definite, loaded=bool(scene.loads)
         )
@@ -88,6 +101,18 @@ class StrainDependent(SteppedModel):
 
     def dofs(self, scene: Scene) -> int:
         return len(scene.actuators)
+
+    def dof_labels(self, size: int) -> None:
+        return None
+
+    def strain_on(self, scene: Scene, forces: Forces, state: ArmUnknown, grid: Grid) -> Vector:
+        if state.xi[0].shape == grid.X.shape:
+            return state.xi
+        return super().strain_on(scene, forces, state, grid)
+
+    def turning(self, scene: Scene, state: ArmUnknown, grid: Grid) -> Vector:
+        X = self.grid(scene).X.T.reshape(-1)
+        return tuple(jnp.interp(grid.X, X, x.T.reshape(-1)) for x in state.turning)
 
     def strain(
         self, scene: Scene, forces: Forces, state: ArmUnknown, X: Float[Array, " stations"]

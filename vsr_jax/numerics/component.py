@@ -7,11 +7,12 @@ its batch last). The kernels are then elementwise arithmetic, which XLA fuses in
 cannot fuse small batched `dot_general`, `concatenate` and LAPACK calls, so these are avoided.
 """
 
-import operator
+from functools import partial
 from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array
 
 from ..typing import cast
@@ -61,6 +62,29 @@ def symmetric(lower: Matrix) -> Matrix:
     return tuple(tuple(lower[max(i, j)][min(i, j)] for j in range(size)) for i in range(size))
 
 
+def _alike(a: Array | float, b: Array | float) -> bool:
+    """Whether two factors are arrays of one shape and precision.
+
+    `a * b` of JAX then has nothing to convert, but still looks for it, which takes longer than the
+    rest of tracing an operation; `lax.mul` does not look.
+    """
+    return (
+        isinstance(a, Array) and isinstance(b, Array) and a.shape == b.shape and a.dtype == b.dtype
+    )
+
+
+def _sum(a: Array, b: Array) -> Array:
+    return lax.add(a, b) if _alike(a, b) else a + b
+
+
+def _difference(a: Array, b: Array) -> Array:
+    return lax.sub(a, b) if _alike(a, b) else a - b
+
+
+def _product(a: Array | float, b: Array) -> Array:
+    return lax.mul(a, b) if _alike(a, b) else a * b
+
+
 def select(condition: Array, a: Tree, b: Tree) -> Tree:
     """`a` where the condition holds and `b` elsewhere, component by component."""
     return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
@@ -68,22 +92,22 @@ def select(condition: Array, a: Tree, b: Tree) -> Tree:
 
 def add(a: Tree, b: Tree) -> Tree:
     """Sum $a + b$ of two vectors or two matrices, component by component."""
-    return jax.tree.map(operator.add, a, b)
+    return jax.tree.map(_sum, a, b)
 
 
 def subtract(a: Tree, b: Tree) -> Tree:
     """Difference $a - b$ of two vectors or two matrices, component by component."""
-    return jax.tree.map(operator.sub, a, b)
+    return jax.tree.map(_difference, a, b)
 
 
 def multiply(a: Vector, b: Vector) -> Vector:
     """Component-wise product, as of a diagonal matrix and a vector."""
-    return tuple(x * y for x, y in zip(a, b, strict=True))
+    return tuple(_product(x, y) for x, y in zip(a, b, strict=True))
 
 
 def scale(s: Array | float, a: Tree) -> Tree:
     """Product $s a$ of a scalar and a vector or a matrix."""
-    return jax.tree.map(lambda x: s * x, a)
+    return jax.tree.map(partial(_product, s), a)
 
 
 def times(factor: Array | None, a: Tree) -> Tree:
@@ -93,9 +117,9 @@ def times(factor: Array | None, a: Tree) -> Tree:
 
 def dot(a: Vector, b: Vector) -> Array:
     """Scalar product $a \\cdot b$."""
-    total = a[0] * b[0]
+    total = _product(a[0], b[0])
     for x, y in zip(a[1:], b[1:], strict=True):
-        total = total + x * y
+        total = _sum(total, _product(x, y))
     return total
 
 
@@ -108,7 +132,9 @@ def norm(a: Vector) -> Array:
 
 def cross(a: Vector, b: Vector) -> Vector:
     """Vector product $a \\times b$ of two vectors of three components."""
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+    return tuple(
+        _difference(_product(a[i], b[j]), _product(a[j], b[i])) for i, j in ((1, 2), (2, 0), (0, 1))
+    )
 
 
 def skew(v: Vector) -> Matrix:
@@ -158,11 +184,11 @@ def cholesky(lower: Matrix) -> Matrix:
         for j in range(i):
             remainder = row[j]
             for k in range(j):
-                remainder = remainder - entries[k] * factor[j][k]
+                remainder = _difference(remainder, _product(entries[k], factor[j][k]))
             entries.append(remainder / factor[j][j])
         pivot = row[i]
         for entry in entries:
-            pivot = pivot - entry * entry
+            pivot = _difference(pivot, _product(entry, entry))
         entries.append(jnp.sqrt(pivot))
         factor.append(entries)
     return tuple(tuple(row) for row in factor)
@@ -174,10 +200,10 @@ def cholesky_solve(factor: Matrix, right: Vector) -> Vector:
     size = len(x)
     for i in range(size):
         for j in range(i):
-            x[i] = x[i] - factor[i][j] * x[j]
+            x[i] = _difference(x[i], _product(factor[i][j], x[j]))
         x[i] = x[i] / factor[i][i]
     for i in reversed(range(size)):
         for j in range(i + 1, size):
-            x[i] = x[i] - factor[j][i] * x[j]
+            x[i] = _difference(x[i], _product(factor[j][i], x[j]))
         x[i] = x[i] / factor[i][i]
     return tuple(x)

@@ -3,12 +3,13 @@ computation."""
 
 import hashlib
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import equinox as eqx
 import jax
 import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr
 
 
 def fingerprint(function: Callable, arguments: Any, *more: Any) -> str:
@@ -21,7 +22,21 @@ def fingerprint(function: Callable, arguments: Any, *more: Any) -> str:
         return whole(*given)
 
     program = jax.make_jaxpr(run)(arrays)
+    constants = [closed.consts for closed in _nested(program)]
     digest = hashlib.sha256(re.sub(r" at 0x[0-9a-f]+", "", str(program.jaxpr)).encode())
-    for leaf in jax.tree.leaves((program.consts, arrays, more)):
+    for leaf in jax.tree.leaves((constants, arrays, more)):
         digest.update(np.asarray(leaf).tobytes())
     return digest.hexdigest()
+
+
+def _nested(program: ClosedJaxpr) -> Iterator[ClosedJaxpr]:
+    """A program and all programs that it calls, each with its own constants."""
+    yield program
+    for equation in program.jaxpr.eqns:
+        for leaf in jax.tree.leaves(
+            list(equation.params.values()), is_leaf=lambda x: isinstance(x, ClosedJaxpr | Jaxpr)
+        ):
+            if isinstance(leaf, Jaxpr):
+                leaf = ClosedJaxpr(leaf, ())
+            if isinstance(leaf, ClosedJaxpr):
+                yield from _nested(leaf)

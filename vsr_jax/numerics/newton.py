@@ -18,8 +18,8 @@ MAX_DAMPED_STEPS = 200
 MAX_PLAIN_STEPS = 25
 """Bound on the plain Newton steps that follow where damping has failed."""
 LOAD_INCREMENTS = 5
-"""Increments in which `damped_newton` applies the loads: with all loads at once the tangent is
-often indefinite at the start."""
+"""Increments in which `damped_newton` applies the loads where they cannot be applied at once: the
+tangent is often indefinite at the start under all loads."""
 MAX_TURN = 1.5
 """Bound on the angle [rad] by which one step of a loaded solve bends and twists the arm. A step
 that coils the arm may lower the residual without approaching a solution."""
@@ -105,8 +105,10 @@ def newton(evaluate: Callable[[Any], Evaluation], start: Any, floor: Array) -> I
     still = jax.tree.map(jnp.zeros_like, start)
     first = Evaluation(still, jnp.zeros_like(merit), merit, jnp.ones(merit.shape, bool))
     begin = (start, first, jnp.ones_like(merit), jnp.zeros_like(merit), jnp.zeros((), jnp.int32))
-    x, at, _, _, count = lax.while_loop(proceed, advance, begin)
-    return Iterate(jax.tree.map(jnp.subtract, x, at.step), at.definite, count)
+    x, at, fraction, _, count = lax.while_loop(proceed, advance, begin)
+    # a step of which even a fraction was rejected is not taken
+    last = select(fraction == 1, at.step, jax.tree.map(jnp.zeros_like, at.step))
+    return Iterate(jax.tree.map(jnp.subtract, x, last), at.definite, count)
 
 
 class Damped(NamedTuple):
@@ -120,12 +122,34 @@ class Damped(NamedTuple):
     definite: Array
 
 
+class _Guard(NamedTuple):
+    """State of each problem in `damped_newton` besides the point and the step: size of the step and
+    of the sum of all steps to come, size of the residual, whether the tangent is definite, the work
+    of the residual over the step; damping, load increments applied, whether the step may be tried,
+    how often an undamped step raised an accepted residual, whether the loads come by increments,
+    and the number of evaluations and of plain Newton steps."""
+
+    size: Array
+    miss: Array
+    merit: Array
+    definite: Array
+    pull: Array
+    damping: Array
+    applied: Array
+    fresh: Array
+    rises: Array
+    gradual: Array
+    spent: Array
+    plain: Array
+
+
 def damped_newton(
     evaluate: Callable[[Any, Array, Array], Damped],
     work: Callable[[Any, Any], Array],
     start: Any,
     floor: Array,
     increments: int = 1,
+    origin: Any = None,
 ) -> Root:
     r"""Root of a residual that is the gradient of an energy, or nearly so, by Newton's method with
     Levenberg damping.
@@ -135,8 +159,11 @@ def damped_newton(
 
     - Acceptance. A step is accepted if the energy falls along it, $r(x - s) \cdot s \ge -r(x) \cdot
       s$ for the step s that is subtracted, or if the residual becomes smaller.
-    - Load increments. The loads are applied in equal increments, one per accepted step. Steps are
-      always accepted until all loads are applied.
+    - First attempt. All loads are applied at once, without damping. At the first step that is not
+      accepted, and at the first tangent that is not positive definite, the problem begins again
+      from `origin`: the loads are then applied in equal increments, one per accepted step, and
+      steps are always accepted until all loads are applied. A problem with neither increments nor
+      an `origin` begins with the careful attempt.
     - Extrapolation. The tangent may be approximate. Where it is much too stiff for a soft motion of
       the arm, the residual along a full step contracts only by $\rho$ near 1. The next step then
       includes $\rho^2 / (1 - \rho)$ of the last one, the remainder of the geometric series.
@@ -154,10 +181,13 @@ def damped_newton(
     - `work`: scalar product of a residual and a step.
     - `floor`: size of the residual that counts as rounding, one entry per problem.
     - `increments`: number of load increments.
+    - `origin`: where the second attempt begins, the start by default.
 
     **Returns:** a `Root`; it is converged if the residual at the end is rounding or as small as a
     negligible step.
     """
+    twice = increments > 1 or origin is not None
+    origin = start if origin is None else origin
     small = jnp.finfo(floor.dtype).eps ** 0.75
     accepted = jnp.maximum(_ACCEPTED * floor, small)
 
@@ -171,93 +201,101 @@ def damped_newton(
         x, step, old = state
         plain = (old.spent >= MAX_DAMPED_STEPS) | (old.damping >= _MAX_DAMPING) | (old.plain > 0)
         trial = jax.tree.map(lambda a, s: jnp.where(old.fresh, a - s.astype(a.dtype), a), x, step)
-        damping = jnp.where(plain, 0.0, jnp.where(old.fresh, _lowered(old.damping), old.damping))
-        applied = jnp.where(
-            plain,
-            increments,
-            jnp.where(old.fresh, jnp.minimum(old.applied + 1, increments), old.applied),
-        )
+        damping, applied = _attempt(old, plain, increments)
         new = evaluate(trial, damping, applied / increments)
         left = work(new.residual, step)
-        better = (
-            (old.applied < increments)
-            | (left >= -old.pull)
-            | (new.merit < old.merit)
-            | (new.merit < floor)
-            | plain
-        )
-        taken = ~old.fresh | (jnp.isfinite(new.merit) & better)
-        damping = jnp.where(
-            taken & (new.definite | plain), damping, _raised(jnp.where(taken, damping, old.damping))
-        )
-        whole = (old.damping == 0) & (damping == 0) & old.fresh & (old.applied == increments)
-        more = _extrapolated(
-            whole & (new.merit > 4 * floor), jnp.minimum(left / old.pull, new.size / old.size)
-        )
-        new = new._replace(
-            step=jax.tree.map(lambda s, last: s + more.astype(s.dtype) * last, new.step, step)
-        )
-        rho = jnp.where(whole, jnp.clip(new.size / old.size, 0.0, _MAX_CONTRACTION), 0.0)
-        rises = old.rises + (whole & (old.merit <= accepted) & (new.merit >= old.merit)).astype(
-            jnp.int32
-        )
-        there = _Guard(
-            new.size,
-            new.size / (1 - rho),
-            new.merit,
-            new.definite,
-            work(new.residual, new.step),
-            damping,
-            applied,
-            new.definite | plain,
-            rises,
-            old.spent,
-            old.plain,
-        )
-        here = old._replace(damping=damping, fresh=plain)
-        guard = select(taken, there, here)._replace(
-            spent=old.spent + 1, plain=old.plain + plain.astype(jnp.int32)
-        )
-        # a rejected step is computed again with more damping before it is used; that of a problem
-        # that is done is never used
+        taken = _accepted(old, new, left, floor, plain, increments)
+        guard, more = _judged(old, new, left, taken, plain, damping, applied, floor, accepted)
+        new_step = jax.tree.map(lambda s, last: s + more.astype(s.dtype) * last, new.step, step)
+        guard = guard._replace(pull=jnp.where(taken, work(new.residual, new_step), guard.pull))
         go = pending(old)
-        return select(go & taken, trial, x), new.step, select(go, guard, old)
+        x = select(go & taken, trial, x)
+        if not twice:
+            return x, new_step, select(go, guard, old)
+        again = go & ~old.gradual & ~(taken & new.definite)
+        guard = select(again, begin._replace(gradual=~no, spent=guard.spent), guard)
+        new_step = jax.tree.map(lambda s: jnp.where(again, 0.0, s).astype(s.dtype), new_step)
+        return select(again, origin, x), new_step, select(go, guard, old)
 
-    zero, no, none = (
-        jnp.zeros_like(floor),
-        jnp.zeros(floor.shape, bool),
-        jnp.zeros(floor.shape, jnp.int32),
+    no, none = jnp.zeros(floor.shape, bool), jnp.zeros(floor.shape, jnp.int32)
+    zero = jnp.zeros_like(floor)
+    damping = jnp.full_like(floor, 0.0 if increments > 1 else _MIN_DAMPING)
+    begin = _Guard(
+        zero, zero, zero + jnp.inf, ~no, zero, damping, zero + 1, no, none, no, none, none
     )
-    damping = jnp.full_like(floor, _MIN_DAMPING if increments == 1 else 0.0)
-    guard = _Guard(zero, zero, zero + jnp.inf, ~no, zero, damping, zero + 1, no, none, none, none)
+    first = begin._replace(applied=zero + increments, damping=zero) if twice else begin
     step = jax.tree.map(
         lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
         jax.eval_shape(evaluate, start, floor, floor).step,
     )
     x, _, guard = lax.while_loop(
-        lambda state: jnp.any(pending(state[2])), advance, (start, step, guard)
+        lambda state: jnp.any(pending(state[2])), advance, (start, step, first)
     )
     return Root(x, guard.merit <= accepted, guard.definite, guard.spent)
 
 
-class _Guard(NamedTuple):
-    """State of each problem in `damped_newton` besides the point and the step: size of the step and
-    of the sum of all steps to come, size of the residual, whether the tangent is definite, the work
-    of the residual over the step; damping, load increments applied, whether the step may be tried,
-    how often an undamped step raised an accepted residual, and the number of evaluations and of
-    plain Newton steps."""
+def _attempt(old: _Guard, plain: Array, increments: int) -> tuple[Array, Array]:
+    """Damping and load increments of the next evaluation: less and more than before if the last
+    step may be tried."""
+    damping = jnp.where(old.fresh, _lowered(old.damping), old.damping)
+    more = jnp.where(old.fresh, jnp.minimum(old.applied + 1, increments), old.applied)
+    return jnp.where(plain, 0.0, damping), jnp.where(plain, increments, more)
 
-    size: Array
-    miss: Array
-    merit: Array
-    definite: Array
-    pull: Array
-    damping: Array
-    applied: Array
-    fresh: Array
-    rises: Array
-    spent: Array
-    plain: Array
+
+def _accepted(
+    old: _Guard, new: Damped, left: Array, floor: Array, plain: Array, increments: int
+) -> Array:
+    """Whether the step to a new point is taken. A point that was evaluated only with more damping
+    is kept.
+
+    **Arguments:** `left`: work of the new residual over the step.
+    """
+    better = (
+        (old.applied < increments)
+        | (left >= -old.pull)
+        | (new.merit < old.merit)
+        | (new.merit < floor)
+        | plain
+    )
+    return ~old.fresh | (jnp.isfinite(new.merit) & better)
+
+
+def _judged(
+    old: _Guard,
+    new: Damped,
+    left: Array,
+    taken: Array,
+    plain: Array,
+    damping: Array,
+    applied: Array,
+    floor: Array,
+    accepted: Array,
+) -> tuple[_Guard, Array]:
+    """State after an evaluation, its `pull` still that of the last step, and the fraction of that
+    step by which the next one is extrapolated."""
+    good = taken & (new.definite | plain)
+    damping = jnp.where(good, damping, _raised(jnp.where(taken, damping, old.damping)))
+    # an undamped step between two residuals under the same loads
+    whole = old.fresh & (old.damping == 0) & (damping == 0) & (old.applied == applied)
+    ratio = new.size / old.size
+    more = _extrapolated(whole & (new.merit > 4 * floor), jnp.minimum(left / old.pull, ratio))
+    rho = jnp.where(whole, jnp.clip(ratio, 0.0, _MAX_CONTRACTION), 0.0)
+    risen = whole & (old.merit <= accepted) & (new.merit >= old.merit)
+    there = old._replace(
+        size=new.size,
+        miss=new.size / (1 - rho),
+        merit=new.merit,
+        definite=new.definite,
+        damping=damping,
+        applied=applied,
+        fresh=new.definite | plain,
+        rises=old.rises + risen.astype(jnp.int32),
+    )
+    here = old._replace(damping=damping, fresh=plain)
+    guard = select(taken, there, here)
+    # a rejected step is computed again with more damping before it is used; that of a problem that
+    # is done is never used
+    return guard._replace(spent=old.spent + 1, plain=old.plain + plain.astype(jnp.int32)), more
 
 
 def _extrapolated(wanted: Array, left: Array) -> Array:

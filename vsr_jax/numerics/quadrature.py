@@ -82,10 +82,13 @@ def _distributed(
     return piece, count[piece].astype(edges.dtype), place - (last - count)[piece]
 
 
-def interpolation(stages: int) -> np.ndarray:
-    r"""Coefficients $b_{pl}$ of the polynomial $\sum_p \sigma^p \sum_l b_{pl} f_l$ through values
-    $f_l$ at the Gauss nodes on [0, 1]."""
-    return np.linalg.inv(np.vander(gauss_legendre(stages)[0], increasing=True))
+def interpolation(stages: int, origin: float = 0.0) -> np.ndarray:
+    r"""Coefficients $b_{pl}$ of the polynomial $\sum_p (\sigma - \sigma_0)^p \sum_l b_{pl} f_l$
+    through values $f_l$ at the Gauss nodes on [0, 1].
+
+    **Arguments:** `stages`; `origin`: $\sigma_0$.
+    """
+    return np.linalg.inv(np.vander(gauss_legendre(stages)[0] - origin, increasing=True))
 
 
 def merging(stages: int) -> np.ndarray:
@@ -98,11 +101,9 @@ def merging(stages: int) -> np.ndarray:
 
 
 def weighted(weights: np.ndarray, values: Array) -> Array:
-    """Weighted sum of the values at the nodes of a step."""
-    total = float(weights[0]) * values[0]
-    for i in range(1, len(weights)):
-        total = total + float(weights[i]) * values[i]
-    return total
+    """Weighted sums of the values at the nodes of a step, one for weights of shape (stages,), or
+    one per row of a matrix of weights."""
+    return jnp.tensordot(jnp.asarray(weights, values.dtype), values, 1, precision="highest")
 
 
 def beyond(density: Vector, grid: Grid) -> Vector:
@@ -114,19 +115,17 @@ def beyond(density: Vector, grid: Grid) -> Vector:
     stages = grid.X.shape[0]
     nodes, weights = gauss_legendre(stages)
     powers = np.arange(1, stages + 1)
-    rest = weights - (nodes[:, None] ** powers / powers) @ interpolation(
-        stages
-    )  # of the integral over a step of length 1
+    # of the integral over a step of length 1
+    rest = weights - (nodes[:, None] ** powers / powers) @ interpolation(stages)
 
     def add(total: Vector, part: Vector) -> tuple[Vector, Vector]:
         return c.add(total, part), total
 
-    parts = tuple(weighted(weights, grid.h * q) for q in density)
+    # the last row is the whole step
+    sums = [weighted(np.vstack([rest, weights]), grid.h * q) for q in density]
+    parts = tuple(part[-1] for part in sums)
     _, later = lax.scan(add, tuple(jnp.zeros_like(part[0]) for part in parts), parts, reverse=True)
-    return tuple(
-        jnp.stack([past + grid.h * weighted(row, q) for row in rest])
-        for past, q in zip(later, density, strict=True)
-    )
+    return tuple(part[:-1] + past for part, past in zip(sums, later, strict=True))
 
 
 def locate(grid: Grid, X: Array) -> tuple[Array, Array]:

@@ -40,27 +40,34 @@ def exp_coefficients(x: Array) -> tuple[Array, Array, Array]:
     theta = jnp.sqrt(above)
     sine, half = jnp.sin(theta), jnp.sin(0.5 * theta)
     closed = (sine / theta, 2.0 * half * half / above, (theta - sine) / (above * theta))
-    series = (_stumpff(below, n) for n in (1, 2, 3))
+    c2, c3 = _stumpff(below, 2)
+    series = (1.0 - below * c3, c2, c3)
     a, b, c3 = (jnp.where(near, s, f) for s, f in zip(series, closed, strict=True))
     return a, b, c3
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(1,))
-def _stumpff(x: Array, n: int) -> Array:
-    r"""Series of the Stumpff function $c_n(x) = \sum_j (-x)^j / (2 j + n)!$ for $0 \le x < 4$.
+def _stumpff(x: Array, n: int) -> tuple[Array, Array]:
+    r"""Series of the Stumpff functions $c_n$ and $c_{n+1}$, $c_n(x) = \sum_j (-x)^j / (2 j + n)!$,
+    for $0 \le x < 4$.
 
-    Its derivative is $c_n' = -\frac12 (c_{n+1} - n\,c_{n+2})$, two series of the same kind.
+    Their derivatives are $c_n' = -\frac12 (c_{n+1} - n\,c_{n+2})$, of which one further pair is
+    new.
     """
-    value = jnp.zeros_like(x)
+    first = second = jnp.zeros_like(x)
     for j in reversed(range(_TERMS)):
-        value = 1.0 / math.factorial(2 * j + n) - x * value
-    return value
+        first = 1.0 / math.factorial(2 * j + n) - x * first
+        second = 1.0 / math.factorial(2 * j + n + 1) - x * second
+    return first, second
 
 
 @_stumpff.defjvp
-def _stumpff_jvp(n: int, primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+def _stumpff_jvp(n: int, primals: tuple[Array], tangents: tuple[Array]) -> tuple[Any, Any]:
     (x,), (dx,) = primals, tangents
-    return _stumpff(x, n), -0.5 * (_stumpff(x, n + 1) - n * _stumpff(x, n + 2)) * dx
+    first, second = _stumpff(x, n)
+    third, fourth = _stumpff(x, n + 2)
+    rates = second - n * third, third - (n + 1) * fourth
+    return (first, second), tuple(-0.5 * rate * dx for rate in rates)
 
 
 def rotation_components(k: Vector) -> Matrix:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from ..files.output import replacing
 from ..numerics.fingerprint import fingerprint
 from .descent import DescentState, DesignProblem, History, first_update
 
@@ -63,15 +64,13 @@ class Checkpoint:
             return eqx.tree_deserialise_leaves(file, (states, History(like, like)))
 
     def write(self, states: DescentState, history: History) -> None:
-        """Replaces the file; an interrupted write leaves the previous file intact."""
+        """Replaces the file atomically."""
         if self._path is None:
             return
-        part = self._path.with_name(self._path.name + ".part")
         header = {"design": self._digest, "steps": len(history.objective)}
-        with part.open("wb") as file:
+        with replacing(self._path) as part, part.open("wb") as file:
             file.write(json.dumps(header).encode() + b"\n")
             eqx.tree_serialise_leaves(file, (jax.tree.map(jnp.asarray, states), history))
-        part.replace(self._path)
 
 
 def _header(line: bytes) -> dict[str, Any]:

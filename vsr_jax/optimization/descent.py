@@ -127,24 +127,26 @@ def begin(
     seed: int,
 ) -> DescentState:
     """Initial states: the first start at the given numbers, every other at the best of `candidates`
-    random points."""
+    random points, the first of them if none has an equilibrium."""
     generator = np.random.default_rng(seed)
     first = jax.tree.map(bounded.coordinate, problem.low, problem.high, given)
     margins = eqx.filter_eval_shape(problem.loss, problem.low, jnp.ones(()))[1][1]
     bad = jnp.full((starts, *margins.shape), -jnp.inf, margins.dtype)
-    worst = Best({}, jnp.full(starts, jnp.inf, margins.dtype), bad)
-    best = None
-    for _ in range(candidates):
+
+    def draw() -> Numbers:
         drawn = {
             name: jnp.asarray(generator.uniform(size=(starts, *low.shape)), low.dtype)
             for name, low in problem.low.items()
         }
-        z = jax.tree.map(lambda share, own: bounded.at_share(share).at[0].set(own), drawn, first)
-        so_far = worst._replace(z=z) if best is None else best
-        state = DescentState(z, z, jax.vmap(optimizer.init)(z), so_far)
+        return jax.tree.map(lambda share, own: bounded.at_share(share).at[0].set(own), drawn, first)
+
+    points = [draw() for _ in range(candidates)]
+    worst = Best(points[0], jnp.full(starts, jnp.inf, margins.dtype), bad)
+    best = worst
+    for z in points:
+        state = DescentState(z, z, jax.vmap(optimizer.init)(z), best)
         best = descend(problem, optimizer, state, penalty_weight(0, 1))[0].best
-    z = worst.z if best is None else best.z
-    return DescentState(z, z, jax.vmap(optimizer.init)(z), worst._replace(z=z))
+    return DescentState(best.z, best.z, jax.vmap(optimizer.init)(best.z), worst._replace(z=best.z))
 
 
 @eqx.filter_jit

@@ -32,33 +32,33 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..arm.scene import Scene
-from ..files.scene_file import at, check_keys, kind_of, load, parse_table
+from ..files.scene_file import construct, kind_of, load, parse_table
+from ..validation import instance
 from . import constraint, objective
 from .constraint import Constraint
 from .objective import Objective
 from .problem import Bounds
 from .search import Search
 
-_OBJECTIVES = {
-    kind.__name__: kind
-    for kind in (
-        objective.TipError,
-        objective.CurveError,
-        objective.Workspace,
-        objective.TipCompliance,
-        objective.Tension,
-    )
-}
-_CONSTRAINTS = {
-    kind.__name__: kind
-    for kind in (
-        constraint.Inside,
-        constraint.MinSpacing,
-        constraint.MaxTension,
-        constraint.BendRadius,
-        constraint.StabilityMargin,
-    )
-}
+
+def _by_name(*kinds: type) -> dict[str, type]:
+    return {kind.__name__: kind for kind in kinds}
+
+
+_OBJECTIVES = _by_name(
+    objective.TipError,
+    objective.CurveError,
+    objective.Workspace,
+    objective.TipCompliance,
+    objective.Tension,
+)
+_CONSTRAINTS = _by_name(
+    constraint.Inside,
+    constraint.MinSpacing,
+    constraint.MaxTension,
+    constraint.BendRadius,
+    constraint.StabilityMargin,
+)
 _KEYS = ("title", "scene", "inputs", "free", "uncertain", "objectives", "constraints", "search")
 
 
@@ -80,15 +80,12 @@ def load_design(path: str | PathLike[str]) -> DesignFile:
 
     **Raises:** a one-line `ValueError` that begins with the file's name, as `load`.
     """
+    file = Path(path)
     try:
-        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        return _parsed(tomllib.loads(file.read_text(encoding="utf-8")), file.parent)
     except OSError as error:
         raise ValueError(f"{path}: {error.strerror}") from None
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-    try:
-        return _parsed(table, Path(path).parent)
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:
         raise ValueError(f"{path}: {error}") from None
 
 
@@ -100,25 +97,22 @@ def _parsed(table: dict[str, Any], folder: Path) -> DesignFile:
     missing = [key for key in ("scene", "free", "objectives") if key not in table]
     if missing:
         raise ValueError(f"missing key {missing[0]!r}, known are {known}")
-    file = (
-        load(folder / table["scene"])
-        if isinstance(table["scene"], str)
-        else parse_table(table["scene"], "scene")
-    )
+    scene = instance("scene", table["scene"], str | dict, "a file or a table [scene]")
+    file = load(folder / scene) if isinstance(scene, str) else parse_table(scene, "scene")
     inputs = table.get("inputs", None if file.inputs is None else [file.inputs.tolist()])
     if inputs is None:
         raise ValueError("missing key 'inputs', and the scene has none")
     return DesignFile(
         str(table.get("title", "")),
         file.scene,
-        table["free"],
+        instance("free", table["free"], dict, "a table [free] of bounds"),
         _objective(_tables(table, "objectives")),
         inputs,
         [
             _constraint(one, f"constraints[{i}]")
             for i, one in enumerate(_tables(table, "constraints"))
         ],
-        table.get("uncertain", {}),
+        instance("uncertain", table.get("uncertain", {}), dict, "a table [uncertain] of numbers"),
         _search(table.get("search", {})),
     )
 
@@ -148,14 +142,10 @@ def _constraint(table: dict[str, Any], path: str) -> Constraint:
 def _search(table: dict[str, Any]) -> Search:
     if not isinstance(table, dict) or "optimizer" in table:
         raise ValueError(f"search: got {table!r}, need a table of numbers")
-    return _made({"type": "Search", **table}, "search", {"Search": Search})
+    return _made({"type": "Search", **table}, "search", _by_name(Search))
 
 
 def _made(table: dict[str, Any], path: str, group: dict[str, type]) -> Any:
     kind = kind_of(table, path, group)
     arguments = {key: value for key, value in table.items() if key != "type"}
-    check_keys(kind, arguments, path)
-    try:
-        return kind(**arguments)
-    except (ValueError, TypeError) as error:
-        raise ValueError(at(path, str(error))) from None
+    return construct(kind, arguments, path)

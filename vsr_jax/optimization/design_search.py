@@ -14,6 +14,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
+import optax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 from tqdm import tqdm
@@ -61,8 +62,8 @@ class Design(NamedTuple):
     - `objective`: its value there. `feasible`: whether all constraints are satisfied.
     - `margins`: least margin of each constraint by name, dimensionless, negative if violated.
     - `free`: names of the free numbers.
-    - `starts`: the best of each start, in order. `history`: objective and violation of each start
-      at each step.
+    - `starts`: the best of each start, in order, and `best`, the index of the best of them.
+    - `history`: objective and violation of each start at each step.
     """
 
     scene: Scene
@@ -72,6 +73,7 @@ class Design(NamedTuple):
     margins: dict[str, float]
     free: tuple[str, ...]
     starts: tuple[Start, ...]
+    best: int
     history: History
 
     @property
@@ -176,19 +178,20 @@ def design(
     rule, settings = search.update_rule, (search.starts, search.candidates, search.seed)
     checkpoint = Checkpoint(out, problem, rule, (*settings, search.steps))
     states = begin(problem, rule, given, *settings)
-    states, history = _run(problem, search, checkpoint, states, progress)
+    states, history = _run(problem, rule, search, checkpoint, states, progress)
     return _result(problem, terms, states, history)
 
 
 def _run(
     problem: DesignProblem,
+    rule: optax.GradientTransformationExtraArgs,
     search: Search,
     checkpoint: Checkpoint,
     states: DescentState,
     progress: bool,
 ) -> tuple[DescentState, History]:
     states, history = checkpoint.read(states)
-    rule, total = search.update_rule, search.steps
+    total = search.steps
     with tqdm(
         total=total, initial=len(history.objective), unit=" steps", disable=not progress
     ) as bar:
@@ -243,5 +246,6 @@ def _result(problem: DesignProblem, terms: Terms, states: DescentState, history:
         dict(zip(names, margins, strict=True)),
         tuple(name for name in (*parameters(one.scene), INPUTS) if name in problem.low),
         starts,
+        best,
         history,
     )

@@ -174,6 +174,8 @@ def _factors(uncertain: Mapping[str, float], known: Mapping[str, Array]) -> dict
     factors, generator = {}, np.random.default_rng(0)
     for pattern, deviation in uncertain.items():
         size = positive(f"uncertain[{pattern!r}]", deviation)
+        if pattern == INPUTS:
+            raise ValueError("uncertain: got 'inputs', need numbers of the scene")
         for name in matching(pattern, known):
             half = generator.standard_normal(_DRAWS // 2)
             factors[name] = jnp.exp(size * jnp.asarray([*half, *-half], known[name].dtype))

@@ -28,7 +28,7 @@ from .quantities import (
     structure,
 )
 from .stability import extreme
-from .summary import Summary, summary_of
+from .summary import Summary, summary_of, values_of
 
 
 class Equilibrium(Solved):
@@ -64,6 +64,13 @@ class Equilibrium(Solved):
         """Message of the status."""
         return Status(int(self.status)).message
 
+    @property
+    def heading(self) -> tuple[str, str]:
+        """First lines of a report of one equilibrium: its status and its effects."""
+        method = f"{type(self.model).__name__}, {self.inputs.dtype}, {int(self.steps)} steps"
+        effects = ", ".join(self.scene.effects) or "none"
+        return f"  status     {self.message} ({method})", f"  effects    {effects}"
+
     def summary(self, X: VectorLike = 61, values: Sequence[str] = ()) -> Summary:
         """All quantities along the arm, and selected other ones, from one compiled program.
 
@@ -78,12 +85,12 @@ class Equilibrium(Solved):
         """
         return summary_of(self, X, values)
 
-    @quantity("see column_units", "row", "column")
+    @quantity("1 and m", "row", "column")
     def tip(self) -> Pose:
         """Pose of the tip, axes of its section and position [m], shape (4, 4)."""
         return self.model.tip(self.scene, self.sound_forces, self.state)
 
-    @along_arm("see column_units", "row", "column")
+    @along_arm("1 and m", "row", "column")
     def pose(self, X: Array) -> Float[Array, "stations 4 4"]:
         """Pose $g(X)$, shape (4, 4) or (stations, 4, 4)."""
         return self.model.poses(self.scene, self.sound_forces, self.state, X)
@@ -186,7 +193,7 @@ class Equilibrium(Solved):
             slack = slack.at[place].set(jnp.where(tension > 0, 0.0, loose))
         return slack
 
-    @quantity("see dof_units", "dof")
+    @quantity("N, or 1/m and 1", "dof")
     def q(self) -> Float[Array, " dofs"]:
         """Coordinates of the strain in the model's basis. For `StrainDependent` they are the thread
         forces (eq. 20)."""
@@ -229,15 +236,15 @@ class Equilibrium(Solved):
     def __str__(self) -> str:
         if is_traced(self.status) or jnp.ndim(self.status) > 0 or not bool(self.converged):
             return repr(self)
-        at = self.summary(jnp.zeros(0), ("tip", "stability", "error"))
-        tip, error = at.values["tip"], at.values["error"].tip
+        values = values_of(self, ("tip", "stability", "error"))
+        tip, error = values["tip"], values["error"].tip
         return "\n".join(
             (
                 f"Equilibrium: converged in {int(self.steps)} steps",
                 f"  model            {self.model!r}, {self.inputs.dtype}",
                 f"  tip              ({', '.join(f'{float(x):.6g}' for x in tip[:3, 3])}) m",
                 f"  estimated error  {float(error):.1e} m",
-                f"  stability margin {float(at.values['stability']):.3g}",
+                f"  stability margin {float(values['stability']):.3g}",
             )
         )
 

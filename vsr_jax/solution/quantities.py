@@ -1,5 +1,4 @@
-"""The table of what can be asked of an equilibrium: name, unit, dimensions and function of each
-quantity.
+"""The table of the quantities of an equilibrium: name, unit, dimensions and function of each.
 
 `Equilibrium` shows every entry as an attribute; `vsr.sweep`, its store, the reports and the
 documentation read unit, dimensions and description here. A new quantity is one entry:
@@ -25,13 +24,13 @@ from ..arm.scene import Scene
 from ..models.base import Status
 from ..numerics.quadrature import onto
 from ..typing import VectorLike
-from ..validation import ROUNDING, on_arm
+from ..validation import ROUNDING, choice, on_arm
 
 T = TypeVar("T")
 
 
 class Solved(eqx.Module):
-    """What an entry of the table needs of an equilibrium besides its own function."""
+    """The part of an equilibrium that entries of the table use."""
 
     scene: eqx.AbstractVar[Scene]
     inputs: eqx.AbstractVar[Float[Array, " inputs"]]
@@ -65,22 +64,29 @@ class Solved(eqx.Module):
         return entry.__get__(self)
 
 
-class Quantity(Generic[T]):
+class _Entry:
+    """What all entries of the table have: the function and what its name and docstring say."""
+
+    def __init__(self, compute: Callable, unit: str):
+        self.name, self.unit, self.compute = compute.__name__, unit, compute
+        self.__doc__ = compute.__doc__
+        text = " ".join((compute.__doc__ or self.name).split())
+        self.description = text.split(". ")[0].strip(".")
+
+
+class Quantity(_Entry, Generic[T]):
     """An entry of the table: a function of an equilibrium, compiled, NaN where the solve failed.
 
     As an attribute of `Equilibrium` it is the value; called with an equilibrium it is the same.
 
-    **Fields:** `name`; `unit`, "see NAME" where it differs along an axis; `dims`, names of the
+    **Fields:** `name`; `unit`, as "1/m and 1" where it differs along an axis; `dims`, names of the
     value's axes, None for a value that is not one array; `description`, the first sentence of the
     function's docstring.
     """
 
     def __init__(self, compute: Callable[..., T], unit: str, dims: tuple[str, ...] | None):
-        self.name, self.unit, self.dims, self.compute = compute.__name__, unit, dims, compute
-        self.__doc__ = compute.__doc__
-        self.description = (
-            " ".join((compute.__doc__ or self.name).split()).split(". ")[0].strip(".")
-        )
+        super().__init__(compute, unit)
+        self.dims = dims
         self._program = eqx.filter_jit(self._masked)
 
     def _masked(self, eq: Solved) -> T:
@@ -98,7 +104,7 @@ class Quantity(Generic[T]):
         return self if eq is None else self(eq)
 
 
-class AlongArm:
+class AlongArm(_Entry):
     """An entry of the table that is a function of abscissas X [m]: one, shape (), or several in a
     row, which become the first axis of the value. NaN beyond the arm where X is traced.
 
@@ -109,8 +115,8 @@ class AlongArm:
     def __init__(
         self, compute: Callable[..., Array], unit: str, dims: tuple[str, ...], of: str | None
     ):
-        self.name, self.unit, self.dims, self.compute = compute.__name__, unit, dims, compute
-        self.__doc__, self.description, self.of = compute.__doc__, _sentence(compute), of
+        super().__init__(compute, unit)
+        self.dims, self.of = dims, of
         self._program = eqx.filter_jit(self.at)
 
     def at(self, eq: Solved, X: Array) -> Array:
@@ -130,11 +136,6 @@ class AlongArm:
     def __get__(self, eq: Solved, owner: Any = None) -> Callable[[VectorLike], Array]: ...
     def __get__(self, eq: Any, owner: Any = None) -> Any:
         return self if eq is None else partial(self, eq)
-
-
-def _sentence(compute: Callable) -> str:
-    """First sentence of a docstring."""
-    return " ".join((compute.__doc__ or compute.__name__).split()).split(". ")[0].strip(".")
 
 
 QUANTITIES: dict[str, Quantity[Any] | AlongArm] = {}
@@ -161,7 +162,11 @@ def along_arm(
 ) -> Callable[[Callable[..., Array]], AlongArm]:
     """`quantity` for a function of an equilibrium and abscissas, shape (stations,), with the
     stations in the value's first axis; `dims` are those of its other axes. With `of`, the name of
-    another entry along the arm, the function takes that entry's value in place of the abscissas."""
+    another entry along the arm, the function takes that entry's value in place of the abscissas.
+
+    **Raises:** `ValueError` for a name that the table has already, and for an `of` that is no entry
+    along the arm.
+    """
     return lambda compute: _entered(AlongArm(compute, unit, dims, of))
 
 
@@ -171,12 +176,17 @@ Entry = TypeVar("Entry", bound="Quantity[Any] | AlongArm")
 def _entered(entry: Entry) -> Entry:
     if entry.name in QUANTITIES:
         raise ValueError(f"quantity: got {entry.name!r}, need a name that the table does not have")
+    if isinstance(entry, AlongArm) and entry.of is not None:
+        along = [name for name, known in QUANTITIES.items() if isinstance(known, AlongArm)]
+        choice("of", entry.of, along)
     QUANTITIES[entry.name] = entry
     return entry
 
 
-def abscissas(eq: Solved, X: VectorLike) -> Array:
+def abscissas(eq: Solved, X: VectorLike, name: str = "X") -> Array:
     """Abscissas [m] on the arm, one or several in a row, in the precision of the equilibrium.
+
+    **Arguments:** `name`: the argument's name in messages.
 
     **Raises:** `ValueError` for a batch of equilibria, another shape, and an X beyond the arm where
     it is known.
@@ -184,8 +194,8 @@ def abscissas(eq: Solved, X: VectorLike) -> Array:
     eq.refuse_batch()
     array = jnp.asarray(X, eq.inputs.dtype)
     if array.ndim > 1:
-        raise ValueError(f"X: got shape {array.shape}, need one abscissa or several in a row")
-    on_arm("X", array, eq.scene.rod.length)
+        raise ValueError(f"{name}: got shape {array.shape}, need one abscissa or several in a row")
+    on_arm(name, array, eq.scene.rod.length)
     return array
 
 

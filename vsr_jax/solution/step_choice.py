@@ -6,6 +6,7 @@ number of steps may be traced. The reference of each trial is the same arm with 
 grid in use. If these are not enough, the next trial has four times the capacity.
 """
 
+from collections.abc import Sequence
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -21,55 +22,31 @@ from ..mechanics.balance import forces_where
 from ..models.base import Status, resolved
 from ..models.strain_dependent import StrainDependent
 from ..numerics.quadrature import Grid, make_grid
-from ..typing import cast
+from ..typing import VectorLike, cast
 from ..validation import instance, interval, is_traced, positive
 
-_ROOMS = (64, 256, 1024)
-"""Capacities of the trial grids, in steps."""
+_CAPACITIES = (64, 256, 1024)
+"""Capacities of the trial grids, in steps: each is one compiled program, so there are few of them,
+and a capacity four times the last wastes little on the steps that stay empty."""
 
-_LADDER = (
-    1,
-    2,
-    3,
-    4,
-    5,
-    6,
-    7,
-    8,
-    9,
-    10,
-    11,
-    12,
-    13,
-    14,
-    15,
-    16,
-    18,
-    20,
-    22,
-    24,
-    26,
-    28,
-    32,
-    36,
-    40,
-    44,
-    48,
-)
-"""Numbers of steps to try with a capacity of 64; larger capacities scale them."""
+_STEP_COUNTS = (*range(1, 17), *range(18, 29, 2), *range(32, 49, 4))
+"""Numbers of steps to try with a capacity of 64, closer together where one step more costs a larger
+share; larger capacities scale them."""
 
 _SHARE = 0.5
 """Largest error of the samples, as a share of the tolerance: other inputs may have a larger
 error."""
 
 _SAMPLES = 16
-"""Trial inputs per plan."""
+"""Trial inputs per plan: the corners of the range of three actuators, and as many random inputs."""
 
 _NOTICED = 0.01
-"""Least effect of a number, as a share of the largest, for its derivative to count."""
+"""Least effect of a number, as a share of the largest, for its derivative to count: the relative
+error of a slope that moves nothing would otherwise decide."""
 
 _ROUNDED = 1e-5
-"""Tolerance, as a share of the length, below which single precision is not tried."""
+"""Tolerance, as a share of the length, below which single precision is not tried: its rounding
+along an arm is about a tenth of that."""
 
 
 class Plan(NamedTuple):
@@ -91,7 +68,11 @@ class Plan(NamedTuple):
 
 
 def plan(
-    scene: Scene, tolerance: float, inputs_range: Any, *, gradient_tolerance: float | None = None
+    scene: Scene,
+    tolerance: float,
+    inputs_range: VectorLike | Sequence[VectorLike],
+    *,
+    gradient_tolerance: float | None = None,
 ) -> Plan:
     """The fewest steps that bring the tip position within `tolerance` for inputs in a range.
 
@@ -147,39 +128,71 @@ def choose(
             "tolerance: got a traced scene or traced inputs, need concrete numbers; under jax.jit "
             "use the result of an earlier vsr.plan"
         )
-    scene, least, most = cast(scene, samples.dtype), np.inf, _LADDER[-1] * _ROOMS[-1] // _ROOMS[0]
-    for room in _ROOMS:
-        ladder = np.array(_LADDER) * (room // _ROOMS[0])
-        trial = scene, samples, jnp.append(jnp.asarray(ladder), room)
-        errors, status = (np.asarray(x) for x in _tip_errors(*trial, room))
-        if np.any(status == Status.UNDER_RESOLVED):
-            continue
-        solved = status == Status.CONVERGED
-        if not np.any(solved):
-            return None
-        worst, slopes = _worst(errors[solved]), None
-        least = min(least, float(np.min(worst)))
-        fits = worst <= _SHARE * tolerance
-        if gradient_tolerance is not None and np.any(fits):
-            slopes = _worst(np.asarray(_gradient_errors(*trial, room))[solved])
-            fits &= slopes <= _SHARE * gradient_tolerance
-        if np.any(fits):
-            first = int(np.argmax(fits))
-            slope = None if slopes is None else float(slopes[first])
-            return Plan(
-                StrainDependent(int(ladder[first])), str(samples.dtype), float(worst[first]), slope
-            )
+    scene, least = cast(scene, samples.dtype), np.inf
+    for capacity in _CAPACITIES:
+        attempt = _attempt(scene, samples, capacity, tolerance, gradient_tolerance)
+        if attempt.plan is not None or not attempt.solvable:
+            return attempt.plan
+        least = min(least, attempt.least)
+    raise _unmet(tolerance, gradient_tolerance, least)
+
+
+class _Attempt(NamedTuple):
+    """Result of the trial solves with one capacity.
+
+    **Fields:** the `plan`, None if no number of steps meets the tolerances; `least`, the least
+    error [m] of the tip over the numbers of steps; `solvable`, whether a sample may have an
+    equilibrium.
+    """
+
+    plan: Plan | None = None
+    least: float = np.inf
+    solvable: bool = True
+
+
+def _attempt(
+    scene: Scene,
+    samples: Array,
+    capacity: int,
+    tolerance: float,
+    gradient_tolerance: float | None,
+) -> _Attempt:
+    counts = np.array(_STEP_COUNTS) * (capacity // _CAPACITIES[0])
+    trial = scene, samples, jnp.append(jnp.asarray(counts), capacity)
+    errors, status = (np.asarray(x) for x in _tip_errors(*trial, capacity))
+    if np.any(status == Status.UNDER_RESOLVED):
+        return _Attempt()
+    solved = status == Status.CONVERGED
+    if not np.any(solved):
+        return _Attempt(solvable=False)
+    worst, slopes = _worst(errors[solved]), None
+    fits = worst <= _SHARE * tolerance
+    if gradient_tolerance is not None and np.any(fits):
+        slopes = _worst(np.asarray(_gradient_errors(*trial, capacity))[solved])
+        fits &= slopes <= _SHARE * gradient_tolerance
+    least = float(np.min(worst))
+    if not np.any(fits):
+        return _Attempt(least=least)
+    first = int(np.argmax(fits))
+    model = StrainDependent(int(counts[first]))
+    slope = None if slopes is None else float(slopes[first])
+    return _Attempt(Plan(model, str(samples.dtype), float(worst[first]), slope), least)
+
+
+def _unmet(tolerance: float, gradient_tolerance: float | None, least: float) -> ValueError:
+    """The error if no capacity is enough; `least`: the least error [m] of the tip."""
+    most = _STEP_COUNTS[-1] * _CAPACITIES[-1] // _CAPACITIES[0]
     if least == np.inf:
-        raise ValueError(
+        return ValueError(
             f"tolerance: got {tolerance:g} m, but the arm bends too fast along its length for "
             f"{most} steps"
         )
     if least <= _SHARE * tolerance:
-        raise ValueError(
+        return ValueError(
             f"gradient_tolerance: got {gradient_tolerance:g}, which {most} steps do not meet, "
             f"need a larger one"
         )
-    raise ValueError(
+    return ValueError(
         f"tolerance: got {tolerance:g} m, need at least {least / _SHARE:.2g} m, the best of up to "
         f"{most} steps"
     )
@@ -191,7 +204,7 @@ def _worst(errors: np.ndarray) -> np.ndarray:
     return np.maximum.accumulate(np.max(np.nan_to_num(errors, nan=np.inf), axis=0)[::-1])[::-1]
 
 
-def _samples(scene: Scene, inputs_range: Any) -> Array:
+def _samples(scene: Scene, inputs_range: VectorLike | Sequence[VectorLike]) -> Array:
     """Corners of the range, all or a random selection, and random inputs between them."""
     size = len(scene.actuators)
     low, high = interval("inputs_range", inputs_range, size)
@@ -230,8 +243,8 @@ class _Trial(StrainDependent):
 
     wanted: Array
 
-    def __init__(self, room: int, wanted: Array):
-        super().__init__(room)
+    def __init__(self, capacity: int, wanted: Array):
+        super().__init__(capacity)
         self.wanted = wanted
 
     def grid(self, scene: Scene) -> Grid:
@@ -247,26 +260,28 @@ def _tip_of(scene: Scene, inputs: Array, model: StrainDependent) -> tuple[Array,
 
 
 @eqx.filter_jit
-def _tip_errors(scene: Scene, samples: Array, steps: Array, room: int) -> tuple[Array, Array]:
+def _tip_errors(scene: Scene, samples: Array, steps: Array, capacity: int) -> tuple[Array, Array]:
     """Distance [m] of the tip from the reference, the solve with the last number of steps, for each
     sample and each other number; and the status of the reference."""
 
     def of(inputs: Array) -> tuple[Array, Array]:
-        tips, status = jax.vmap(lambda wanted: _tip_of(scene, inputs, _Trial(room, wanted)))(steps)
+        tips, status = jax.vmap(lambda wanted: _tip_of(scene, inputs, _Trial(capacity, wanted)))(
+            steps
+        )
         return jnp.linalg.norm(tips[:-1] - tips[-1], axis=1), status[-1]
 
     return lax.map(of, samples)
 
 
 @eqx.filter_jit
-def _gradient_errors(scene: Scene, samples: Array, steps: Array, room: int) -> Array:
+def _gradient_errors(scene: Scene, samples: Array, steps: Array, capacity: int) -> Array:
     """Largest relative error of a derivative, for each sample and each number of steps except the
     last, the reference."""
     numbers_, rest = eqx.partition(scene, eqx.is_inexact_array)
 
     def of(inputs: Array) -> Array:
         def tip(values: Any, wanted: Array) -> Array:
-            return _tip_of(eqx.combine(values[0], rest), values[1], _Trial(room, wanted))[0]
+            return _tip_of(eqx.combine(values[0], rest), values[1], _Trial(capacity, wanted))[0]
 
         values = numbers_, inputs
         slopes = jax.vmap(lambda wanted: jax.jacrev(tip)(values, wanted))(steps)

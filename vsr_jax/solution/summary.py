@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..typing import VectorLike
-from ..validation import choice, is_traced
+from ..validation import choice
 from .quantities import QUANTITIES, AlongArm, Quantity, Solved, abscissas
 
 ANGLES = 24
@@ -34,44 +34,62 @@ class Summary(eqx.Module):
     values: dict[str, Any]
 
     def __getattr__(self, name: str) -> Any:
-        for table in ("along", "values"):
-            if name in self.__dict__.get(table, {}):
-                return self.__dict__[table][name]
+        # copies and pickles ask for attributes before the fields are set
+        tables = [self.__dict__.get(field, {}) for field in ("along", "values")]
+        for table in tables:
+            if name in table:
+                return table[name]
         raise AttributeError(
-            f"Summary has no {name!r}; it has {', '.join([*self.along, *self.values])}"
+            f"Summary has no {name!r}; it has "
+            f"{', '.join(known for table in tables for known in table)}"
         )
 
 
 def summary_of(eq: Solved, X: VectorLike = 61, values: Sequence[str] = ()) -> Summary:
-    """The summary of an equilibrium.
+    """`Equilibrium.summary`."""
+    return _summary(eq, stations(eq, X), _checked(values))
 
-    **Arguments:** `X`: how many stations, evenly spaced on the arm, or their abscissas [m];
-    `values`: other quantities of the table that the same program computes, by name.
 
-    **Raises:** `ValueError` for a batch of equilibria, abscissas beyond the arm, and a name that
-    the table does not have.
+def values_of(eq: Solved, names: Sequence[str]) -> dict[str, Any]:
+    """Quantities that are not functions of X by name, from one compiled program; a `Summary` has
+    the same as its `values`.
+
+    **Raises:** `ValueError` for a batch of equilibria, and a name that the table does not have.
     """
+    eq.refuse_batch()
+    return _values(eq, _checked(names))
+
+
+def _checked(names: Sequence[str]) -> tuple[str, ...]:
     known = [name for name, entry in QUANTITIES.items() if isinstance(entry, Quantity)]
-    names = tuple(choice("values", name, known) for name in values)
-    return _compiled(eq, abscissas(eq, _stations(eq, X)), names)
+    return tuple(choice("values", name, known) for name in names)
 
 
-def _stations(eq: Solved, X: VectorLike) -> Any:
+def stations(eq: Solved, X: VectorLike, name: str = "X") -> Float[Array, " stations"]:
+    """Abscissas [m] of stations, checked, from their number or from the abscissas themselves.
+
+    **Arguments:** `name`: the argument's name in messages.
+    """
     if isinstance(X, int | np.integer) and not isinstance(X, bool):
-        return jnp.linspace(0.0, 1.0, int(X)) * eq.scene.rod.length
-    return X if is_traced(X) else jnp.atleast_1d(jnp.asarray(X))
+        X = jnp.linspace(0.0, 1.0, int(X)) * eq.scene.rod.length
+    return jnp.atleast_1d(abscissas(eq, X, name))
 
 
-def compiled_summary(eq: Solved, X: Array) -> Callable[[Solved, Array], Summary]:
-    """The program of `summary_of`, compiled: for this equilibrium and for all of the same model and
-    kind of scene."""
-    X = X.astype(eq.inputs.dtype)
-    program = _compiled.lower(eq, X, ()).compile()  # pyright: ignore[reportFunctionMemberAccess]
-    return lambda eq, X: program(eq, X.astype(eq.inputs.dtype), ())
+def compiled_summary(eq: Solved, X: VectorLike) -> Callable[[Solved], Summary]:
+    """The program of `summary_of` at given stations, compiled but not run: for this equilibrium and
+    all others of the same model and kind of scene."""
+    at = stations(eq, X)
+    program = _summary.lower(eq, at, ()).compile()  # pyright: ignore[reportFunctionMemberAccess]
+    return lambda eq: program(eq, at, ())
 
 
 @eqx.filter_jit
-def _compiled(eq: Solved, X: Array, names: tuple[str, ...]) -> Summary:
+def _values(eq: Solved, names: tuple[str, ...]) -> dict[str, Any]:
+    return {name: eq.value(name) for name in names}
+
+
+@eqx.filter_jit
+def _summary(eq: Solved, X: Array, names: tuple[str, ...]) -> Summary:
     along: dict[str, Array] = {}
     for name, entry in QUANTITIES.items():  # an entry `of` another comes after it
         if isinstance(entry, AlongArm):
@@ -86,8 +104,7 @@ def _compiled(eq: Solved, X: Array, names: tuple[str, ...]) -> Summary:
     ]
     threads = jnp.stack(paths, axis=1) if paths else jnp.zeros((X.size, 0, 2), X.dtype)
     carried = [_carried(along["pose"], yz) for yz in (threads, wall)]
-    values = {name: eq.value(name) for name in names}
-    return Summary(X, along, jnp.swapaxes(carried[0], 0, 1), carried[1], values)
+    return Summary(X, along, jnp.swapaxes(carried[0], 0, 1), carried[1], _values(eq, names))
 
 
 def _place(path: Any) -> Array:

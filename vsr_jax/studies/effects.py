@@ -27,8 +27,8 @@ PULLED, SHORTENED = (4.0, 2.0), (4.0, -0.003)
 second."""
 
 
-class Rung(NamedTuple):
-    """One scene of the ladder: its name, the scene, the inputs, and whether the tip pose is
+class EffectScene(NamedTuple):
+    """A scene whose cost is measured: its name, the scene, the inputs, and whether the tip pose is
     computed or only the strains."""
 
     name: str
@@ -38,7 +38,7 @@ class Rung(NamedTuple):
 
 
 class Cost(NamedTuple):
-    """Cost of a rung: effects of the scene, operations of the compiled single solve, summaries of
+    """Cost of a scene: its effects, operations of the compiled single solve, summaries of
     `Timed` for a single solve and for a batch, share of the batch that converged."""
 
     name: str
@@ -50,7 +50,7 @@ class Cost(NamedTuple):
     converged: float
 
 
-def ladder() -> list[Rung]:
+def scenes() -> list[EffectScene]:
     """Tendons only, + poses, + gravity, + tip wrench, + follower, + second section, + length
     control, + friction."""
     soft, hard = 4.0e5, 8.0e5
@@ -72,14 +72,14 @@ def ladder() -> list[Rung]:
         Tendon(straight, end=0.15, control="length"),
     ]
     return [
-        Rung("tendons only", Scene(arm, tendons), pose=False),
-        Rung("+ poses", Scene(arm, tendons)),
-        Rung("+ gravity", Scene(arm, tendons, loads[:1])),
-        Rung("+ tip wrench", Scene(arm, tendons, loads[:2])),
-        Rung("+ follower", Scene(arm, tendons, loads)),
-        Rung("+ second section", Scene(jointed, ended, loads)),
-        Rung("+ length control", Scene(jointed, driven, loads), SHORTENED),
-        Rung("+ friction", Scene(jointed, tendons_with_friction, loads), SHORTENED),
+        EffectScene("tendons only", Scene(arm, tendons), pose=False),
+        EffectScene("+ poses", Scene(arm, tendons)),
+        EffectScene("+ gravity", Scene(arm, tendons, loads[:1])),
+        EffectScene("+ tip wrench", Scene(arm, tendons, loads[:2])),
+        EffectScene("+ follower", Scene(arm, tendons, loads)),
+        EffectScene("+ second section", Scene(jointed, ended, loads)),
+        EffectScene("+ length control", Scene(jointed, driven, loads), SHORTENED),
+        EffectScene("+ friction", Scene(jointed, tendons_with_friction, loads), SHORTENED),
     ]
 
 
@@ -89,25 +89,25 @@ def measure(
     model: StrainDependent | None = None,
     report: Callable[[str], object] = lambda message: None,
 ) -> list[Cost]:
-    """Costs of all rungs; rounds of timing cover all rungs in turn.
+    """Costs of all scenes; rounds of timing cover all scenes in turn.
 
     **Arguments:** `batch_size`: shapes in a batch; `rounds`: number of rounds of timing;
-    `model`: 16 steps by default; `report`: called with a message before each rung is compiled.
+    `model`: 16 steps by default; `report`: called with a message before each scene is compiled.
     """
     model = StrainDependent(16) if model is None else model
     scale = np.random.default_rng(0).uniform(0.5, 1.5, (batch_size, 1))
-    rungs, jobs = ladder(), []
-    for rung in rungs:
-        report(f"compiling {rung.name}")
-        jobs.append(_jobs(rung, model, scale))
+    compared, jobs = scenes(), []
+    for one in compared:
+        report(f"compiling {one.name}")
+        jobs.append(_jobs(one, model, scale))
     take_turns((job for pair in jobs for job in pair), rounds)
     costs = []
-    for rung, (single, batch) in zip(rungs, jobs, strict=True):
+    for one, (single, batch) in zip(compared, jobs, strict=True):
         share = float(np.mean(np.asarray(batch.output[1])))
         costs.append(
             Cost(
-                rung.name,
-                rung.scene.effects,
+                one.name,
+                one.scene.effects,
                 single.operations,
                 single.summary(),
                 batch.summary(),
@@ -118,18 +118,18 @@ def measure(
     return costs
 
 
-def _jobs(rung: Rung, model: StrainDependent, scale: np.ndarray) -> tuple[Timed, Timed]:
-    values, fixed = eqx.partition(rung.scene, eqx.is_array)
+def _jobs(compared: EffectScene, model: StrainDependent, scale: np.ndarray) -> tuple[Timed, Timed]:
+    values, fixed = eqx.partition(compared.scene, eqx.is_array)
 
     def one(values: PyTree, inputs: Array) -> tuple[PyTree, Array]:
         scene = eqx.combine(values, fixed)
-        if not rung.pose:
+        if not compared.pose:
             outcome = model.solve(scene, inputs)
             return outcome.state.xi, outcome.status == Status.CONVERGED
         eq = solve(scene, inputs, model=model)
         return eq.tip, eq.converged
 
-    inputs = jnp.asarray(rung.inputs)
+    inputs = jnp.asarray(compared.inputs)
     return Timed(one, values, inputs, calls=3), Timed(
         jax.vmap(one, (None, 0)), values, inputs * jnp.asarray(scale)
     )

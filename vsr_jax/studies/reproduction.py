@@ -1,7 +1,6 @@
 """Reproduction of section IV of the paper: every case, tension and model against the reference
 solutions, as a table and figures."""
 
-import json
 import os
 import platform
 import time
@@ -16,15 +15,15 @@ import matplotlib.pyplot as plt
 import numpy as np
 from tqdm import tqdm
 
+from ..files.output import write_json
 from ..models.base import Model
 from ..models.continuum import Continuum
 from ..models.prescribed import Prescribed
 from ..models.strain_dependent import StrainDependent
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
-from ..solution.summary import Summary
+from ..solution.summary import Summary, compiled_summary
 from ..validation import choice
-from ..viz.plot import sample, sampling
 from . import paper, paper_figures
 
 STATIONS = np.linspace(0.0, paper.LENGTH, 61)
@@ -161,13 +160,15 @@ def _by_program(solved: Sequence[_Solved]) -> list[dict[int, Equilibrium]]:
     return list(groups.values())
 
 
-def _program(group: dict[int, Equilibrium]) -> Callable:
-    return sampling(next(iter(group.values())), STATIONS)
+def _program(group: dict[int, Equilibrium]) -> Callable[[Equilibrium], Summary]:
+    return compiled_summary(next(iter(group.values())), STATIONS)
 
 
-def _curves(group: dict[int, Equilibrium], program: Callable) -> dict[int, Summary | None]:
+def _curves(
+    group: dict[int, Equilibrium], program: Callable[[Equilibrium], Summary]
+) -> dict[int, Summary | None]:
     return {
-        index: sample(eq, STATIONS, program=program) if bool(eq.converged) else None
+        index: jax.tree.map(np.asarray, program(eq)) if bool(eq.converged) else None
         for index, eq in group.items()
     }
 
@@ -286,13 +287,8 @@ def run(
     results = compare(cases, progress=progress)
     rows = [result.row for result in results]
     (folder / "table.md").write_text(table(rows), encoding="utf-8")
-    document = {
-        "machine": conditions(),
-        "rows": [{name: _finite(x) for name, x in row._asdict().items()} for row in rows],
-    }
-    (folder / "table.json").write_text(
-        json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8"
-    )
+    document = {"machine": conditions(), "rows": [row._asdict() for row in rows]}
+    write_json(folder / "table.json", document)
     curves = {
         (r.row.case, r.row.tau, r.row.model): r.samples for r in results if r.samples is not None
     }
@@ -303,10 +299,3 @@ def run(
                 figure.savefig(folder / f"{name}.{ending}", dpi=150)
             plt.close(figure)
     return rows
-
-
-def _finite(value: object) -> object:
-    """`value` with None in place of NaN, which JSON cannot represent."""
-    if isinstance(value, tuple):
-        return [_finite(part) for part in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -4,10 +4,12 @@ ellipsoids of the tip."""
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
+from jaxtyping import Array
 from matplotlib.typing import ColorType
 from mpl_toolkits.mplot3d import Axes3D
 
 from ..analysis.derivatives import Ellipsoid
+from ..arm.loads import Frame
 from ..solution.equilibrium import Equilibrium
 from .plot import COLORS, equal_scale
 
@@ -42,58 +44,65 @@ def frames(
 
 
 def loads(eq: Equilibrium, ax: Axes3D | None = None, *, color: ColorType = COLORS[1]) -> Axes3D:
-    """Forces of the loads as arrows, at points and along the arm; the longest is 16 % of the arm.
+    """Forces of the loads as arrows, at points and along the arm.
+
+    Point forces [N] have one scale and densities [N/m] another: the longest arrow of each is 16 %
+    of the arm. Moments are not drawn.
 
     **Arguments:** `ax`: 3D axes, new ones by default; `color`: of the arrows.
 
     **Returns:** the axes.
     """
     ax, length = _axes(ax), float(eq.scene.rod.length)
-    for here, force in _forces(eq, length):
-        longest = np.max(np.linalg.norm(force, axis=-1), initial=0.0)
-        if longest > 0:
-            ax.quiver(
-                *here.T,
-                *(2 * _SHARE * length / longest * force.T),
-                color=color,
-                linewidth=1.2,
-                arrow_length_ratio=0.25,
-            )
-            ends = here + 2 * _SHARE * length / longest * force
-            ax.auto_scale_xyz(
-                *ends.T, had_data=True
-            )  # without had_data the limits would contain only these ends
+    for groups in (_point_forces(eq), _densities(eq, length)):
+        longest = max((_longest(force) for _, force in groups), default=0.0)
+        for here, force in groups:
+            if _longest(force) == 0:
+                continue
+            arrows = 2 * _SHARE * length / longest * force
+            ax.quiver(*here.T, *arrows.T, color=color, linewidth=1.2, arrow_length_ratio=0.25)
+            # without had_data the limits would contain only these ends
+            ax.auto_scale_xyz(*(here + arrows).T, had_data=True)
     equal_scale(ax)
     return ax
 
 
-def _forces(eq: Equilibrium, length: float) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Positions [m] and forces in the world's axes: point forces, then densities along the arm."""
+def _longest(force: np.ndarray) -> float:
+    return float(np.max(np.linalg.norm(force, axis=-1), initial=0.0))
+
+
+_FRAMES: tuple[Frame, ...] = ("world", "body")
+
+
+def _point_forces(eq: Equilibrium) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Positions [m] and forces [N] in the world's axes of the dead and the follower loads at
+    points."""
     found = []
-    for frame in ("world", "body"):
+    for frame in _FRAMES:
         points = eq.scene.point_wrenches(frame)
-        X = jnp.stack([x for x, _ in points]) if points else jnp.zeros(0)
-        force = (
-            jnp.stack([jnp.stack(wrench[3:]) for _, wrench in points])
-            if points
-            else jnp.zeros((0, 3))
-        )
-        found.append((X, force, frame))
-        X = jnp.linspace(0, length, 12)
+        if points:
+            force = jnp.stack([jnp.stack(wrench[3:]) for _, wrench in points])
+            found.append(_placed(eq, jnp.stack([x for x, _ in points]), force, frame))
+    return found
+
+
+def _densities(eq: Equilibrium, length: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Positions [m] and forces per length [N/m] in the world's axes of the dead and the follower
+    loads along the arm."""
+    X, found = jnp.linspace(0, length, 12), []
+    for frame in _FRAMES:
         density = eq.scene.density(X, frame)
         if density is not None:
-            found.append((X, jnp.stack(density[3:], axis=-1), frame))
-    drawn = []
-    for X, force, frame in found:
-        if X.size:
-            poses = np.asarray(eq.pose(X))
-            turned = (
-                np.einsum("xij,xj->xi", poses[:, :3, :3], np.asarray(force))
-                if frame == "body"
-                else np.asarray(force)
-            )
-            drawn.append((poses[:, :3, 3], turned))
-    return drawn
+            found.append(_placed(eq, X, jnp.stack(density[3:], axis=-1), frame))
+    return found
+
+
+def _placed(eq: Equilibrium, X: Array, force: Array, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
+    """Positions at abscissas X, and the vectors there in the world's axes."""
+    poses, vectors = np.asarray(eq.pose(X)), np.asarray(force)
+    if frame == "body":
+        vectors = np.einsum("xij,xj->xi", poses[:, :3, :3], vectors)
+    return poses[:, :3, 3], vectors
 
 
 def ellipsoid(

@@ -3,23 +3,24 @@
 The package does not import this module on its own; use `from vsr_jax import plot`.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
-from jaxtyping import Array
+from jax.typing import ArrayLike
+from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.ticker import MaxNLocator
+from matplotlib.typing import ColorType, LineStyleType
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 
 from ..arm.rod import STRAINS
 from ..solution.equilibrium import Equilibrium
-from ..solution.summary import ANGLES, Summary, compiled_summary
+from ..solution.summary import Summary, stations as checked_stations
 from ..typing import VectorLike
-from ..validation import choice, on_arm
+from ..validation import choice
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 """The palette of Okabe and Ito, which colour-blind readers can distinguish."""
@@ -37,13 +38,10 @@ _LEAST_SPAN = 0.02
 _THINNEST_BOX = 0.35
 
 
-def sample(
-    eq: Equilibrium, stations: VectorLike = 60, *, program: Callable | None = None
-) -> Summary:
+def sample(eq: Equilibrium, stations: VectorLike = 60) -> Summary:
     """The summary of an equilibrium in NumPy arrays; `arm` and `strains` take it in place of `eq`.
 
-    **Arguments:** `stations`: number of stations, evenly spaced on the arm, or their abscissas [m];
-    `program`: the result of `sampling`.
+    **Arguments:** `stations`: number of stations, evenly spaced on the arm, or their abscissas [m].
 
     **Raises:** `ValueError` for a batch of equilibria, for one that did not converge and for
     stations beyond the arm.
@@ -52,35 +50,21 @@ def sample(
         raise ValueError(f"eq: got a batch of shape {np.shape(eq.status)}, need one equilibrium")
     if not bool(eq.converged):
         raise ValueError(f"eq: got a solve that failed ({eq.message}), need a converged one")
-    on_arm("stations", _abscissas(eq, stations), eq.scene.rod.length)
-    found = eq.summary(stations) if program is None else program(eq, _abscissas(eq, stations))
-    return jax.tree.map(np.asarray, found)
-
-
-def sampling(eq: Equilibrium, stations: VectorLike = 60) -> Callable:
-    """The compiled program of `sample`, for this equilibrium and all others with the same model and
-    scene structure."""
-    return compiled_summary(eq, _abscissas(eq, stations))
-
-
-def _abscissas(eq: Equilibrium, stations: VectorLike) -> Array:
-    if isinstance(stations, int | np.integer):
-        return jnp.linspace(0.0, 1.0, int(stations)) * eq.scene.rod.length
-    return jnp.asarray(stations, eq.inputs.dtype)
+    return jax.tree.map(np.asarray, eq.summary(checked_stations(eq, stations, "stations")))
 
 
 def arm(
     eq: Equilibrium | Summary,
-    ax: Any = None,
+    ax: Axes3D | None = None,
     *,
-    color: Any = COLORS[0],
+    color: ColorType = COLORS[0],
     label: str | None = None,
-    linestyle: Any = "-",
+    linestyle: LineStyleType = "-",
     stations: VectorLike = 60,
     surface: bool = True,
     threads: bool = True,
     **line: Any,
-) -> Any:
+) -> Axes3D:
     """The deformed arm in 3D: its axis, its translucent outer wall and its threads, at equal scale.
 
     **Arguments:**
@@ -108,8 +92,8 @@ def arm(
             color=color,
             alpha=0.18,
             linewidth=0,
-            rcount=60,
-            ccount=ANGLES,
+            rstride=1,
+            cstride=1,
             rasterized=True,
         )
     if threads:
@@ -121,7 +105,7 @@ def arm(
     return ax
 
 
-def equal_scale(ax: Any, *, zoom: float = 1.1) -> None:
+def equal_scale(ax: Axes3D, *, zoom: float = 1.1) -> None:
     """Sets one scale for x, y and z: the box has the proportions of the data, with no side shorter
     than about a third of the longest.
 
@@ -144,21 +128,21 @@ def equal_scale(ax: Any, *, zoom: float = 1.1) -> None:
         margin = 0.06 * (end - start)  # ticks at a corner would overlap those of the next side
         axis.set_ticks(ticks[(ticks > start + margin) & (ticks < end - margin)])
         ax.set(**{f"{name}lim": (start, end)})
-    ax.set_box_aspect(span, zoom=zoom)
+    ax.set_box_aspect(span, zoom=zoom)  # pyright: ignore[reportArgumentType] (its default is an int)
 
 
-def _around(middle: Any, span: Any) -> tuple[Any, Any]:
+def _around(middle: np.ndarray, span: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return middle - span / 2, middle + span / 2
 
 
 def strains(
     eq: Equilibrium | Summary,
-    ax: Any = None,
+    ax: Sequence[Axes] | np.ndarray | None = None,
     *,
     names: Sequence[str] = STRAINS,
-    color: Any = COLORS[0],
+    color: ColorType = COLORS[0],
     label: str | None = None,
-    linestyle: Any = "-",
+    linestyle: LineStyleType = "-",
     stations: VectorLike = 60,
     **line: Any,
 ) -> np.ndarray:
@@ -208,12 +192,12 @@ def _panels(number: int) -> np.ndarray:
 
 
 def workspace(
-    positions: Any,
-    ax: Any = None,
+    positions: ArrayLike,
+    ax: Sequence[Axes] | np.ndarray | None = None,
     *,
-    values: Any = None,
+    values: ArrayLike | None = None,
     label: str = "",
-    color: Any = COLORS[0],
+    color: ColorType = COLORS[0],
     most: int = 20_000,
 ) -> np.ndarray:
     """The workspace of the tip: its positions in 3D, and projected along each axis.
@@ -256,6 +240,6 @@ def _corner() -> np.ndarray:
     )
 
 
-def shade(color: Any) -> tuple[float, ...]:
+def shade(color: ColorType) -> tuple[float, ...]:
     """A darker shade of a colour, for lines drawn over it."""
     return tuple(0.55 * part for part in to_rgb(color))

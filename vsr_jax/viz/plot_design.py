@@ -28,10 +28,7 @@ def history(design: Design, ax: Axes | None = None) -> Axes:
     feasible = np.where(design.history.violation <= 0, design.history.objective, np.inf)
     so_far = np.minimum.accumulate(np.where(np.isnan(feasible), np.inf, feasible), axis=0)
     so_far[np.isinf(so_far)] = np.nan
-    best = min(
-        range(len(design.starts)),
-        key=lambda i: (design.starts[i].violation, design.starts[i].objective),
-    )
+    best = design.best
     for i in [*(i for i in range(so_far.shape[1]) if i != best), best]:
         style = (
             {"color": COLORS[0], "linewidth": 2.0, "label": "best start"}
@@ -54,16 +51,17 @@ def before_after(
     *,
     model: Model | None = None,
 ) -> Axes3D:
-    """The arm of the initial scene, and the arm of the design for its first set of inputs.
+    """The arm of the initial scene, if it has an equilibrium, and the arm of the design for its
+    first set of inputs.
 
     **Arguments:** `scene`, `inputs`: before the design; `ax`: 3D axes, new ones by default;
     `model`: as for `solve`.
 
     **Returns:** the axes.
     """
-    space: Axes3D = plot.arm(
-        solve(scene, inputs, model=model), ax, color=COLORS[1], label="before", linestyle="--"
-    )
-    plot.arm(solve(design.scene, design.inputs[0], model=model), space, label="after")
+    before = solve(scene, inputs, model=model)
+    if bool(before.converged):
+        ax = plot.arm(before, ax, color=COLORS[1], label="before", linestyle="--")
+    space = plot.arm(solve(design.scene, design.inputs[0], model=model), ax, label="after")
     space.legend(frameon=False)
     return space

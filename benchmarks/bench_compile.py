@@ -1,0 +1,170 @@
+"""Size of the programs of bare and loaded arms, time to trace and to compile them, time of a solve,
+and Newton steps of random loaded arms; of two checkouts in one run.
+
+    python benchmarks/bench_compile.py [--against DIR] [--rounds N] [--draws N] [--json FILE]
+
+Each measurement is made in a process of its own, so that nothing is compiled already. With
+`--against` another checkout of the package is measured in turn with this one, and the last column
+is the ratio of this one to it. "equations" are those of the jaxpr, with the body of a loop counted
+once; they do not depend on the machine. "one" is a solve with its tip, "gradient" its derivative by
+the inputs.
+"""
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from ordinary_scenes import STRUCTURES, built, plain
+
+import vsr_jax as vsr
+from vsr_jax.studies import paper
+from vsr_jax.studies.timing import machine, primitives
+
+STEPS = 24
+HERE = Path(__file__).resolve().parent.parent
+
+
+def scenes() -> dict[str, tuple[vsr.Scene, Any]]:
+    """Scenes and inputs by name."""
+    steel = vsr.Rod(1.0, vsr.Circular(2e-3), vsr.Material(200e9, poisson=0.3, density=7800.0))
+    loads = [
+        vsr.Gravity(),
+        vsr.PointWrench(0.5, (0.0, 1.0, 0.0)),
+        vsr.TipWrench((0.0, 0.0, 2.0)),
+    ]
+    nitinol = vsr.Rod(0.2, vsr.Circular(1e-3), vsr.Material(60e9, poisson=0.3, density=6000.0))
+    angles = [
+        (end, k * np.pi / 2 + turn) for end, turn in ((0.1, 0.0), (0.2, 0.7)) for k in range(4)
+    ]
+    tendons = [
+        vsr.Tendon(vsr.Parallel(7e-4 * np.cos(angle), 7e-4 * np.sin(angle)), end=end)
+        for end, angle in angles
+    ]
+    tip = [vsr.Gravity(), vsr.TipWrench((0.0, 0.0, 0.2))]
+    return {
+        "B1": (paper.scene("B1"), jnp.array([-10.0])),
+        "steel rod": (
+            vsr.Scene(steel, [vsr.Tendon(vsr.Parallel(1e-3, 0.0))], loads),
+            jnp.array([10.0]),
+        ),
+        "catheter": (vsr.Scene(nitinol, tendons, tip), jnp.arange(8.0)),
+    }
+
+
+def program(name: str, gradient: bool) -> dict[str, float]:
+    """Size and times of one program."""
+    scene, inputs = scenes()[name]
+
+    def tip(inputs: jax.Array) -> jax.Array:
+        return vsr.solve(scene, inputs, model=vsr.StrainDependent(STEPS)).tip[1, 3]
+
+    function: Callable = jax.grad(tip) if gradient else tip
+    start = time.perf_counter()
+    traced = jax.jit(function).trace(inputs)
+    lowered, first = traced.lower(), time.perf_counter()
+    compiled, second = lowered.compile(), time.perf_counter()
+    jax.block_until_ready(compiled(inputs))
+    runs = []
+    for _ in range(50):
+        begin = time.perf_counter()
+        jax.block_until_ready(compiled(inputs))
+        runs.append(time.perf_counter() - begin)
+    return {
+        "equations": primitives(traced.jaxpr.jaxpr).total(),
+        "trace_s": first - start,
+        "compile_s": second - first,
+        "run_ms": 1e3 * statistics.median(runs),
+    }
+
+
+def newton_steps(name: str, draws: int) -> dict[str, float]:
+    """Evaluations of the loaded solve over random draws of a structure."""
+    structure, random = STRUCTURES[name], np.random.default_rng(0)
+    drawn = [plain(structure.numbers(random)) for _ in range(draws)]
+    numbers = {key: jnp.array([one[key] for one in drawn]) for key in drawn[0]}
+
+    def solved(one: Any) -> tuple[jax.Array, jax.Array]:
+        eq = vsr.solve(*built(structure, one), model=vsr.StrainDependent(STEPS))
+        return eq.converged, eq.steps
+
+    converged, steps = (np.asarray(x) for x in jax.jit(jax.vmap(solved))(numbers))
+    found = steps[converged]
+    low, middle, high = np.percentile(found, (10, 50, 90))
+    return {
+        "converged": float(converged.mean()),
+        "mean": float(found.mean()),
+        "10%": float(low),
+        "median": float(middle),
+        "90%": float(high),
+        "most": float(found.max()),
+    }
+
+
+def measured(checkout: Path, *arguments: str) -> dict[str, float]:
+    """One measurement in a process of its own that imports the package from a checkout."""
+    environment = os.environ | {"PYTHONPATH": str(checkout), "VSR_JAX_CACHE": "off"}
+    command = [sys.executable, __file__, "--measure", *arguments]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def compare(options: argparse.Namespace) -> list[dict[str, Any]]:
+    """All measurements, in turn between the checkouts."""
+    checkouts = {"this": HERE} | ({"other": options.against} if options.against else {})
+    jobs = [(name, kind) for name in scenes() for kind in ("one", "gradient")]
+    jobs += [(name, str(options.draws)) for name in STRUCTURES]
+    rows = []
+    for name, kind in jobs:
+        taken: dict[str, list[dict[str, float]]] = {side: [] for side in checkouts}
+        for _ in range(1 if kind.isdigit() else options.rounds):
+            for side, checkout in checkouts.items():
+                taken[side].append(measured(checkout, name, kind))
+        for key in taken["this"][0]:
+            values = {s: statistics.median(one[key] for one in taken[s]) for s in checkouts}
+            spread = {
+                s: max(one[key] for one in taken[s]) - min(one[key] for one in taken[s])
+                for s in checkouts
+            }
+            rows.append({"name": name, "kind": kind, "quantity": key, **values, "spread": spread})
+            ratio = values["this"] / values["other"] if options.against else float("nan")
+            texts = [f"{values[s]:12.4g} +-{spread[s] / 2:8.2g}" for s in checkouts]
+            print(f"{name:24} {kind:9} {key:10} {'  '.join(texts)}  {ratio:6.2f}", flush=True)
+    return rows
+
+
+def main() -> None:
+    """Runs the command."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--against", type=Path, metavar="DIR", help="another checkout")
+    parser.add_argument("--rounds", type=int, default=3, help="processes per program (default: 3)")
+    parser.add_argument("--draws", type=int, default=100, help="arms per structure (default: 100)")
+    parser.add_argument("--json", metavar="FILE", help="save the figures")
+    parser.add_argument("--measure", nargs=2, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    if options.measure:
+        name, kind = options.measure
+        drawn = kind.isdigit()
+        one = newton_steps(name, int(kind)) if drawn else program(name, kind == "gradient")
+        print(json.dumps(one))
+        return
+    rows = compare(options)
+    if options.json:
+        content = {"machine": machine(), "steps": STEPS, "rows": rows}
+        Path(options.json).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,70 @@
+"""Compiled programs kept between runs of the command."""
+
+import argparse
+import os
+import subprocess
+import sys
+import time
+
+import pytest
+
+import vsr_jax as vsr
+from vsr_jax.cli import compiling
+from vsr_jax.studies import paper
+
+MAIN = "import sys; from vsr_jax.cli.main import main; sys.exit(main())"
+
+
+def run(folder, scene, *arguments):
+    """A solve in a process of its own, as a user runs it."""
+    environment = os.environ | {"VSR_JAX_CACHE": str(folder)}
+    command = [sys.executable, "-c", MAIN, "solve", str(scene), *arguments]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    return done.stdout
+
+
+def programs(folder):
+    return sorted(path.name for path in folder.iterdir() if path.name.endswith("-cache"))
+
+
+@pytest.mark.slow
+def test_a_second_run_adds_no_program_and_says_the_same(tmp_path):
+    folder, scene = tmp_path / "cache", tmp_path / "arm.toml"
+    vsr.save(paper.scene("A1"), scene, [-1.0])
+    first = run(folder, scene)
+    kept = programs(folder)
+    assert kept
+    assert run(folder, scene) == first
+    assert programs(folder) == kept
+    run(folder, scene, "--no-cache", "--steps", "7")
+    assert programs(folder) == kept
+
+
+def test_the_folder_is_that_of_the_variable_or_the_users(monkeypatch, tmp_path):
+    monkeypatch.setenv("VSR_JAX_CACHE", str(tmp_path))
+    assert compiling.cache_folder() == tmp_path
+    monkeypatch.setenv("VSR_JAX_CACHE", "off")
+    assert compiling.cache_folder() is None
+    monkeypatch.delenv("VSR_JAX_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "users"))
+    monkeypatch.setattr(sys, "platform", "linux")
+    assert compiling.cache_folder() == tmp_path / "users" / "vsr_jax"
+
+
+@pytest.mark.parametrize(("most", "left"), [(25, ["b", "c"]), (100, ["a", "b", "c"]), (0, [])])
+def test_the_programs_used_longest_ago_are_removed_first(tmp_path, most, left):
+    for age, name in enumerate("cba"):
+        (tmp_path / name).write_bytes(bytes(10))
+        os.utime(tmp_path / name, (1000 - age, 1000 - age))
+    compiling.remove_oldest(tmp_path, most)
+    assert sorted(path.name for path in tmp_path.iterdir()) == left
+
+
+def test_a_command_that_was_silent_for_long_says_that_it_compiles(monkeypatch, capsys):
+    with compiling.compiling(argparse.Namespace(no_cache=True)):
+        time.sleep(0.05)
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(compiling, "SILENT", 0.0)
+    with compiling.compiling(argparse.Namespace(no_cache=True)):
+        time.sleep(0.5)
+    assert capsys.readouterr().err == "vsr-jax: compiling\n"
