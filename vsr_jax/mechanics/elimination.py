@@ -21,27 +21,45 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..numerics import component as c
+from ..numerics import component as c, stacked
 from ..numerics.component import Matrix, Vector
 from ..numerics.quadrature import Grid
+from ..numerics.stacked import affine, columns, matmul, matvec, once, rows, skew, transpose
 from .balance import free_block, free_components, spread
-from .reaction import Loading, Reaction, turned
+from .reaction import Loading, Reaction
 
 UNSTABLE_SECTION = 1_000_000
 """Number of negative eigenvalues reported for a section that is unstable by itself: more than
 cables can stabilise."""
 
 
+class _Node(NamedTuple):
+    """What the elimination needs of a node: the tangent H (6, 6), the right side, the strain, the
+    reaction (6), the rotation (3, 3) and its weight; the follower density and the follower wrench
+    at the end of its cell in the world frame (6), None where there are none."""
+
+    H: Array
+    right: Array
+    xi: Array
+    wrench: Array
+    rotation: Array
+    weight: Array
+    density: Array | None
+    jump: Array | None
+
+
 class EliminationCell(NamedTuple):
-    r"""Coefficients of one cell that do not depend on P, in the frame of its section.
+    r"""Coefficients of one cell that do not depend on P, in the frame of its section. An affine
+    function of the rotation $\theta$ at its start is a matrix with the constant as fourth column.
 
     - `width` w; `turn`: rotation of the next node's section in this frame.
-    - $\kappa = $ `compliance` $\delta m$ + `by_theta` $\theta$ + `bend`, with $\delta m$ the part
+    - $\kappa = $ `compliance` $\delta m$ + `by_theta` $\theta$, affine, with $\delta m$ the part
       from P at the middle of the cell.
-    - Over the cell the moment changes by `moment` $\theta$ + `by_bend` $\kappa$ + `moment_0`.
+    - Over the cell the moment changes by `moment` $\theta$ (affine) + `by_bend` $\kappa$.
     - With follower loads only, else None: the effect of the change of the force on the strain,
       `by_push`, and on the moment, `stretch`; the `axis` u; `force`, the change of the force over
       half the cell per rotation (None without follower density); `jump`, the follower wrench at the
@@ -49,28 +67,25 @@ class EliminationCell(NamedTuple):
     """
 
     width: Array
-    turn: Matrix
-    compliance: Matrix
-    by_theta: Matrix
-    bend: Vector
-    moment: Matrix
-    by_bend: Matrix
-    moment_0: Vector
-    by_push: Matrix | None = None
-    stretch: Matrix | None = None
-    axis: Vector | None = None
-    force: Matrix | None = None
-    jump: Vector | None = None
+    turn: Array
+    compliance: Array
+    by_theta: Array
+    moment: Array
+    by_bend: Array
+    by_push: Array | None = None
+    stretch: Array | None = None
+    axis: Array | None = None
+    force: Array | None = None
+    jump: Array | None = None
 
 
 class EliminatedLinear(NamedTuple):
-    r"""The eliminated linear strains of a node: `flexibility` $(\delta n$ + `by_theta` $\theta$ +
-    `right`) $-$ `by_bend` $\kappa$, with $\delta n$ the part of the force from P."""
+    r"""The eliminated linear strains of a node: `flexibility` $(\delta n$ + `by_theta` $\theta)
+    -$ `by_bend` $\kappa$, with $\delta n$ the part of the force from P; `by_theta` is affine."""
 
-    flexibility: Matrix
-    by_theta: Matrix
-    right: Vector
-    by_bend: Matrix
+    flexibility: Array
+    by_theta: Array
+    by_bend: Array
 
 
 def eliminate(
@@ -100,160 +115,160 @@ def eliminate(
         return spread(x, free), jnp.where(
             jnp.any(jnp.isnan(x[-1]), axis=(0, 1)), UNSTABLE_SECTION, 0
         ).astype(jnp.int32)
-    flat = jax.tree.map(_flat, (lower, right, xi, along.wrench, along.rotation))
-    lower, right, xi, wrench, rotation = c.keep(flat, flat[1][0])
-    loads = loads._replace(follower_density=jax.tree.map(_flat, loads.follower_density))
-    cells, linear, local = _cells(
-        lower, right, xi, wrench, rotation, loads, _flat(grid.weight), free
+    nodes = _nodes(c.symmetric(lower), right, xi, along, loads, grid)
+    cells, linear, local = jax.vmap(lambda *node: _cell_of(*node, free, loads.follows))(
+        nodes, _turns(nodes.rotation)
     )
-    cells = cells._replace(jump=jax.tree.map(_flat, _jumps(along, loads, grid)))
-    zero = jnp.zeros_like(right[0][0])
-    nothing = (zero, zero, zero)
-    size = 6 if loads.follows else 3
-    _, (X, x, push, negative) = lax.scan(
-        _cell, ((nothing,) * size, (zero,) * size), cells, reverse=True
-    )
+    arms = nodes.weight.shape[1:]
+    nothing = jnp.zeros((6 if loads.follows else 3, 4, *arms), cells.width.dtype)
+    _, (X, push, negative) = lax.scan(_cell, nothing, cells, reverse=True)
 
-    def forward(theta: Vector, cell: tuple) -> tuple[Vector, tuple[Vector, Vector]]:
-        X, x, turn, width = cell
-        kappa = c.add(c.matvec(X, theta), x)
-        return c.matvec(c.transpose(turn), c.add(theta, c.scale(width, kappa))), (theta, kappa)
+    def forward(theta: Array, cell: tuple) -> tuple[Array, tuple[Array, Array]]:
+        X, turn, width = cell
+        kappa = affine(X, theta)
+        return matvec(transpose(turn), theta + width * kappa), (theta, kappa)
 
-    _, (theta, kappa) = lax.scan(forward, nothing, (X, x, cells.turn, cells.width))
-    force = c.add(c.matvec(linear.by_theta, theta), linear.right)
-    if push is not None:
-        force = c.add(
-            force, c.add(c.matvec(push[0], c.add(theta, c.scale(cells.width, kappa))), push[1])
-        )
-    upsilon = c.subtract(c.matvec(linear.flexibility, force), c.matvec(linear.by_bend, kappa))
-    strain = tuple(_unflat(x, grid) for x in (*kappa, *upsilon))
-    return strain, jnp.where(
+    start = jnp.zeros((3, *arms), X.dtype)
+    _, (theta, kappa) = lax.scan(forward, start, (X, cells.turn, cells.width))
+    strain = jax.vmap(_strain)(linear, cells.width, push, theta, kappa)
+    return _components(strain, grid), jnp.where(
         jnp.all(local, axis=0), jnp.sum(negative, axis=0, dtype=jnp.int32), UNSTABLE_SECTION
     )
 
 
-def _flat(x: Array) -> Array:
-    """Nodes one after another along the arm, from node arrays."""
-    return x.swapaxes(0, 1).reshape(-1, *x.shape[2:])
+def _nodes(
+    H: Matrix, right: Vector, xi: Vector, along: Reaction, loads: Loading, grid: Grid
+) -> _Node:
+    """The nodes one after another along the arm, in the first axis."""
+    arms = jnp.broadcast_shapes(*(x.shape[2:] for x in (*right, *xi, *along.wrench, grid.weight)))
+
+    def listed(x: Array) -> Array:
+        """Of arrays (stages, steps, ...)."""
+        return x.swapaxes(0, 1).reshape(-1, *x.shape[2:])
+
+    def joined(components: Vector, *shape: int) -> Array:
+        whole = [jnp.broadcast_to(x, (*x.shape[:2], *arms)) for x in components]
+        return listed(jnp.stack(whole, axis=2)).reshape(-1, *shape, *arms)
+
+    density, jumps = loads.follower_density, _jumps(along, loads, grid)
+    return _Node(
+        joined(sum(H, ()), 6, 6),
+        joined(right, 6),
+        joined(xi, 6),
+        joined(along.wrench, 6),
+        joined(sum(along.rotation, ()), 3, 3),
+        jnp.broadcast_to(listed(grid.weight), (grid.weight.size, *arms)),
+        None if density is None else joined(density, 6),
+        None if jumps is None else joined(jumps, 6),
+    )
 
 
-def _unflat(x: Array, grid: Grid) -> Array:
-    return x.reshape(-1, grid.X.shape[0], *x.shape[1:]).swapaxes(0, 1)
+def _components(strain: Array, grid: Grid) -> Vector:
+    """Component arrays (stages, steps, *arms) of strains (nodes, 6, *arms)."""
+    by_step = strain.reshape(-1, grid.X.shape[0], *strain.shape[1:]).swapaxes(0, 1)
+    return tuple(by_step[:, :, i] for i in range(6))
 
 
-def _cells(
-    lower: Matrix,
-    right: Vector,
-    xi: Vector,
-    wrench: Vector,
-    rotation: Matrix,
-    loads: Loading,
-    w: Array,
-    free: tuple[int, ...],
+def _strain(
+    linear: EliminatedLinear, width: Array, push: Array | None, theta: Array, kappa: Array
+) -> Array:
+    """The strain (6,) at a node."""
+    force = affine(linear.by_theta, theta)
+    if push is not None:
+        force = force + affine(push, theta + width * kappa)
+    upsilon = matvec(linear.flexibility, force) - matvec(linear.by_bend, kappa)
+    return jnp.concatenate([kappa, upsilon])
+
+
+def _cell_of(
+    node: _Node, turn: Array, free: tuple[int, ...], follows: bool
 ) -> tuple[EliminationCell, EliminatedLinear, Array]:
-    """All that does not depend on P, for all nodes at once, and whether each section is stable by
-    itself."""
-    half, n = 0.5 * w, c.skew(wrench[3:])
-    moment, by_force, force = _per_rotation(n, c.skew(xi[3:]), loads, half)
-    moment = c.keep(c.scale(half, moment), xi[0])
-    by_theta, H = c.add(moment, c.skew(wrench[:3])), c.symmetric(lower)
-    flexibility, rigid = _inverse(
-        tuple(row[3:] for row in H[3:]), tuple(i - 3 for i in free if i > 2)
-    )
-    mixed = c.add(tuple(row[3:] for row in H[:3]), c.scale(half, n))
-    D = c.keep(c.matmul(mixed, flexibility), xi[0])
-    stiff = c.subtract(
-        tuple(row[:3] for row in H[:3]),
-        c.add(c.scale(half, by_theta), c.matmul(D, c.transpose(mixed))),
-    )
-    by_bend = c.transpose(D)
+    """All that does not depend on P, for one node, and whether its section is stable by itself."""
+    w = node.weight
+    half, n = 0.5 * w, skew(rows(node.wrench, 3, 6))
+    moment, by_force, force = _per_rotation(n, skew(rows(node.xi, 3, 6)), node.density, half)
+    moment = once(half * moment)
+    by_theta = moment + skew(rows(node.wrench, 0, 3))
+    bending, stretching = rows(node.H, 0, 3), rows(node.H, 3, 6)
+    flexibility, rigid = _inverse(columns(stretching, 3, 6), tuple(i - 3 for i in free if i > 2))
+    mixed = columns(bending, 3, 6) + half * n
+    D = matmul(mixed, flexibility)
+    stiff = columns(bending, 0, 3) - half * by_theta - matmul(D, transpose(mixed))
+    by_bend = transpose(D)
     if force is not None:
-        stiff = c.add(stiff, c.matmul(D, c.scale(half, force)))
-        by_bend = c.subtract(by_bend, c.matmul(flexibility, c.scale(half, force)))
-    drive, bend = (
-        c.subtract(by_theta, c.matmul(D, by_force)),
-        c.subtract(right[:3], c.matvec(D, right[3:])),
-    )
-    stiff, drive, bend, moved, pushed = c.keep(
-        (stiff, drive, bend, c.matmul(flexibility, by_force), c.matvec(flexibility, right[3:])),
-        xi[0],
-    )
-    compliance, stable = _inverse(stiff, tuple(i for i in free if i < 3))
-    lever = c.scale(-w, n)  # moment over the cell per linear strain
+        stiff = stiff + matmul(D, half * force)
+        by_bend = by_bend - matmul(flexibility, half * force)
+    right = node.right[:, None]
+    linear = jnp.concatenate([by_force, rows(right, 3, 6)], axis=1)
+    drive = jnp.concatenate([by_theta, rows(right, 0, 3)], axis=1) - matmul(D, linear)
+    compliance, stable = _inverse(once(stiff), tuple(i for i in free if i < 3))
+    lever = -w * n  # moment over the cell per linear strain
+    turned = jnp.concatenate([2.0 * moment, jnp.zeros_like(right[:3])], axis=1)
     cell = EliminationCell(
         w,
-        _turns(rotation),
+        turn,
         compliance,
-        c.matmul(compliance, drive),
-        c.matvec(compliance, bend),
-        c.add(c.scale(2.0, moment), c.matmul(lever, moved)),
-        c.subtract(c.scale(w, moment), c.matmul(lever, by_bend)),
-        c.matvec(lever, pushed),
+        matmul(compliance, drive),
+        turned + matmul(lever, matmul(flexibility, linear)),
+        w * moment - matmul(lever, by_bend),
     )
-    if loads.follows:
-        by_push, stretch = c.scale(-1.0, c.matmul(compliance, D)), c.matmul(lever, flexibility)
-        cell = cell._replace(by_push=by_push, stretch=stretch, axis=xi[3:], force=force)
-    return cell, EliminatedLinear(flexibility, by_force, right[3:], by_bend), rigid & stable
+    if follows:
+        jump = node.jump
+        cell = cell._replace(
+            by_push=-matmul(compliance, D),
+            stretch=matmul(lever, flexibility),
+            axis=rows(node.xi, 3, 6),
+            force=force,
+            jump=None if jump is None else _in_body(node.rotation, jump),
+        )
+    return cell, EliminatedLinear(flexibility, linear, by_bend), rigid & stable
+
+
+def _in_body(rotation: Array, wrench: Array) -> Array:
+    """A wrench (6,) of the world frame in the frame of a section."""
+    back = transpose(rotation)
+    return jnp.concatenate([matvec(back, rows(wrench, 0, 3)), matvec(back, rows(wrench, 3, 6))])
 
 
 def _per_rotation(
-    n: Matrix, u: Matrix, loads: Loading, half: Array
-) -> tuple[Matrix, Matrix, Matrix | None]:
+    n: Array, u: Array, density: Array | None, half: Array
+) -> tuple[Array, Array, Array | None]:
     """Derivatives by the rotation of a section, without those through P: of the change of the
     moment per length, of the force, and of the change of the force over half a cell, which is None
     without follower density."""
-    density = loads.follower_density
     if density is None:
-        return c.matmul(n, u), n, None
-    force = c.scale(-half, c.skew(density[3:]))
-    moment = c.add(c.matmul(n, u), c.matmul(u, force))
-    return c.subtract(moment, c.skew(density[:3])), c.add(n, force), force
+        return matmul(n, u), n, None
+    force = -half * skew(rows(density, 3, 6))
+    moment = matmul(n, u) + matmul(u, force) - skew(rows(density, 0, 3))
+    return moment, n + force, force
 
 
-def _inverse(matrix: Matrix, places: tuple[int, ...]) -> tuple[Matrix, Array]:
+def _inverse(matrix: Array, places: tuple[int, ...]) -> tuple[Array, Array]:
     """Inverse of the block of a 3 x 3 matrix at given indices, zero elsewhere, and whether its
     leading minors are positive."""
-    zero = jnp.zeros_like(matrix[0][0])
+    if not places:
+        return jnp.zeros_like(matrix), jnp.ones(matrix.shape[2:], bool)
     # the cube of the stiffness of a thin arm underflows in single precision
-    scale = sum((jnp.abs(matrix[i][i]) for i in places), zero)
-    matrix = tuple(tuple(x / scale for x in row) for row in matrix)
-    if len(places) == 3:
-        adjugate, det = c.adjugate(matrix)
-        definite = (matrix[0][0] > 0) & (adjugate[2][2] > 0) & (det > 0)
-    elif len(places) == 2:
-        (a, b), (d, e) = (tuple(matrix[i][j] for j in places) for i in places)
-        adjugate, det = ((e, -b), (-d, a)), a * e - b * d
-        definite = (a > 0) & (det > 0)
-    elif len(places) == 1:
-        adjugate, det = ((jnp.ones_like(zero),),), matrix[places[0]][places[0]]
-        definite = det > 0
-    else:
-        return ((zero,) * 3,) * 3, jnp.ones_like(zero, bool)
-    entries = {
-        (i, j): adjugate[p][q] / (det * scale)
-        for p, i in enumerate(places)
-        for q, j in enumerate(places)
-    }
-    return tuple(tuple(entries.get((i, j), zero) for j in range(3)) for i in range(3)), definite
+    scale = sum((jnp.abs(matrix[i, i]) for i in places[1:]), jnp.abs(matrix[places[0], places[0]]))
+    matrix, inside = matrix / scale, np.isin(np.arange(3), places)
+    block = (inside[:, None] & inside).reshape(3, 3, *(1,) * scale.ndim)
+    if len(places) < 3:
+        matrix = jnp.where(block, matrix, stacked.identity(matrix))
+    adjugate, det = stacked.adjugate(matrix)
+    definite = (matrix[0, 0] > 0) & (adjugate[2, 2] > 0) & (det > 0)
+    inverse = adjugate / (det * scale)
+    return inverse if len(places) == 3 else jnp.where(block, inverse, 0.0), definite
 
 
-def _turns(R: Matrix) -> Matrix:
+def _turns(R: Array) -> Array:
     """Rotation of the next node's section in the frame of each node; the identity for the last."""
-    relative = c.matmul(
-        c.transpose(jax.tree.map(lambda x: x[:-1], R)), jax.tree.map(lambda x: x[1:], R)
-    )
-
-    def followed(x: Array, last: float) -> Array:
-        return jnp.concatenate([x, jnp.full_like(x[:1], last)])
-
-    return tuple(
-        tuple(followed(x, float(i == j)) for j, x in enumerate(row))
-        for i, row in enumerate(relative)
-    )
+    relative = jax.vmap(lambda here, after: matmul(transpose(here), after))(R[:-1], R[1:])
+    last = jnp.broadcast_to(stacked.identity(R[0]), R[0].shape)
+    return jnp.concatenate([relative, last[None]])
 
 
 def _jumps(along: Reaction, loads: Loading, grid: Grid) -> Vector | None:
-    """Follower wrenches at points, each at the last node before it."""
+    """Follower wrenches at points in the world frame, each at the last node before it."""
     total = None
     for point, wrench in zip(loads.follower_points, along.points, strict=True):
         step = jnp.arange(grid.h.shape[0]).reshape(-1, *(1,) * point.step.ndim) == point.step - 1
@@ -264,67 +279,53 @@ def _jumps(along: Reaction, loads: Loading, grid: Grid) -> Vector | None:
         )
         here = c.scale(place, wrench)
         total = here if total is None else c.add(total, here)
-    return None if total is None else turned(c.transpose(along.rotation), total)
+    return total
 
 
-def _cell(end: tuple[Matrix, Vector], cell: EliminationCell) -> tuple[tuple[Matrix, Vector], tuple]:
-    r"""One cell, from its end to its start: P and p at the start, and the bending as $X \theta + x$
-    of the rotation at the start."""
-    P, p = _seen_from_here(*end, cell)
-    mean, mean_p = _carried(P, p, cell, 0.5)
-    Q, q = c.matmul(cell.compliance, mean[:3]), c.matvec(cell.compliance, mean_p[:3])
-    whole, whole_p = _carried(P, p, cell, 1.0)
-    rows, rows_p = whole[:3], whole_p[:3]
+def _cell(end: Array, cell: EliminationCell) -> tuple[Array, tuple]:
+    r"""One cell, from its end to its start: the affine change of the wrench at the start, (3, 4) or
+    with follower loads (6, 4), and the affine bending $X \theta$ by the rotation at the start."""
+    P = _seen_from_here(end, cell)
+    width, (mean, whole) = cell.width, _carried(P, cell)
+    Q = matmul(cell.compliance, mean)
     if cell.by_push is not None and cell.stretch is not None:
-        Q, q = c.add(Q, c.matmul(cell.by_push, P[3:])), c.add(q, c.matvec(cell.by_push, p[3:]))
-        rows, rows_p = (
-            c.add(rows, c.matmul(cell.stretch, P[3:])),
-            c.add(rows_p, c.matvec(cell.stretch, p[3:])),
-        )
-    Q, q = c.keep((Q, q), p[0])
-    less = c.scale(-cell.width, Q)
-    pivot = tuple(
-        tuple(1.0 + x if i == j else x for j, x in enumerate(row)) for i, row in enumerate(less)
-    )
-    adjugate, det = c.adjugate(pivot)
-    negative = _negative(_trace(pivot), _trace(adjugate), det)
-    solved = c.matmul(adjugate, c.add(Q, cell.by_theta)), c.matvec(adjugate, c.add(q, cell.bend))
-    X, x = jax.tree.map(lambda entry: entry / det, solved)
-    by_bend = c.add(c.scale(cell.width, rows), cell.by_bend)
-    start = c.add(c.add(rows, cell.moment), c.matmul(by_bend, X))
-    start_p = c.add(c.add(rows_p, cell.moment_0), c.matvec(by_bend, x))
-    if len(p) == 3:
-        return (start, start_p), (X, x, None, negative)
-    by_bend, force = c.scale(cell.width, P[3:]), P[3:]
-    if cell.force is not None:
-        by_bend, force = (
-            c.add(by_bend, c.scale(cell.width, cell.force)),
-            c.add(force, c.scale(2.0, cell.force)),
-        )
-    start = (*start, *c.add(force, c.matmul(by_bend, X)))
-    start_p = (*start_p, *c.add(p[3:], c.matvec(by_bend, x)))
-    return (start, start_p), (X, x, (P[3:], p[3:]), negative)
-
-
-def _seen_from_here(P: Matrix, p: Vector, cell: EliminationCell) -> tuple[Matrix, Vector]:
-    """P and p at the start of the next cell in the frame of this node, including the follower
-    wrench between them."""
-    T, like = cell.turn, p[0]
-    blocks = [c.matmul(c.matmul(T, P[i : i + 3]), c.transpose(T)) for i in range(0, len(p), 3)]
-    P, p = sum(blocks, ()), sum((c.matvec(T, p[i : i + 3]) for i in range(0, len(p), 3)), ())
-    if cell.jump is not None:
-        P = c.subtract(P, (*c.skew(cell.jump[:3]), *c.skew(cell.jump[3:])))
-    return c.keep((P, p), like)
-
-
-def _carried(P: Matrix, p: Vector, cell: EliminationCell, part: float) -> tuple[Matrix, Vector]:
-    """Change of the wrench at a fraction of the cell before its end, including the moment of the
-    change of the force."""
+        Q, whole = Q + matmul(cell.by_push, P[3:]), whole + matmul(cell.stretch, P[3:])
+    Q = once(Q)
+    pivot = stacked.identity(Q) - width * columns(Q, 0, 3)
+    adjugate, det = stacked.adjugate(pivot)
+    negative = _negative(stacked.trace(pivot), stacked.trace(adjugate), det)
+    X = matmul(adjugate, Q + cell.by_theta) / det
+    start = whole + cell.moment + matmul(width * columns(whole, 0, 3) + cell.by_bend, X)
     if cell.axis is None:
-        return P, p
-    arm = c.skew(c.scale(part * cell.width, cell.axis))
-    moment, moment_p = c.add(P[:3], c.matmul(arm, P[3:])), c.add(p[:3], c.matvec(arm, p[3:]))
-    return (*moment, *P[3:]), (*moment_p, *p[3:])
+        return start, (X, None, negative)
+    force, by_bend = P[3:], width * columns(P[3:], 0, 3)
+    if cell.force is not None:
+        by_bend = by_bend + width * cell.force
+        none = jnp.zeros_like(columns(force, 3, 4))
+        force = force + jnp.concatenate([2.0 * cell.force, none], axis=1)
+    return jnp.concatenate([start, force + matmul(by_bend, X)]), (X, P[3:], negative)
+
+
+def _seen_from_here(P: Array, cell: EliminationCell) -> Array:
+    """P at the start of the next cell in the frame of this node, including the follower wrench
+    between them."""
+    parts = []
+    for i in range(0, P.shape[0], 3):
+        turned = matmul(cell.turn, rows(P, i, i + 3))
+        by_theta = matmul(columns(turned, 0, 3), transpose(cell.turn))
+        if cell.jump is not None:
+            by_theta = by_theta - skew(rows(cell.jump, i, i + 3))
+        parts.append(jnp.concatenate([by_theta, columns(turned, 3, 4)], axis=1))
+    return parts[0] if len(parts) == 1 else jnp.concatenate(parts)
+
+
+def _carried(P: Array, cell: EliminationCell) -> tuple[Array, Array]:
+    """Change of the moment at the middle and at the start of the cell, including that by the change
+    of the force."""
+    if cell.axis is None:
+        return P, P
+    moment, lever = P[:3], matmul(skew(cell.width * cell.axis), P[3:])
+    return moment + 0.5 * lever, moment + lever
 
 
 def _negative(trace: Array, minors: Array, det: Array) -> Array:
@@ -335,7 +336,3 @@ def _negative(trace: Array, minors: Array, det: Array) -> Array:
     return 3 - sum(
         (change.astype(jnp.int32) for change in changes), jnp.zeros(trace.shape, jnp.int32)
     )
-
-
-def _trace(matrix: Matrix) -> Array:
-    return matrix[0][0] + matrix[1][1] + matrix[2][2]

@@ -1,0 +1,89 @@
+"""Vectors and small matrices as arrays whose first axes are their components: a vector (3, ...), a
+matrix (3, 3, ...), with the arms of a batch in the axes behind.
+
+Where products of matrices follow each other, as in passes along an arm, this takes a tenth of the
+operations of separate component arrays (`component`): programs compile several times faster, and
+one arm takes fewer and larger operations. In the last axis of a batch both are equally fast.
+"""
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+
+def stack(components: tuple[Array, ...], axis: int = 0) -> Array:
+    """Array of components that broadcast to one shape."""
+    return jnp.stack(jnp.broadcast_arrays(*components), axis)
+
+
+def once(x: Array) -> Array:
+    """The same values, computed once: XLA on CPU recomputes sums and products in each of their
+    uses, but never a division."""
+    return x / (1.0 + 0.0 * lax.stop_gradient(x))
+
+
+def rows(x: Array, start: int, end: int) -> Array:
+    """Components from `start` to before `end` of the first axis."""
+    return lax.slice_in_dim(x, start, end)
+
+
+def columns(x: Array, start: int, end: int) -> Array:
+    """Components from `start` to before `end` of the second axis."""
+    return lax.slice_in_dim(x, start, end, axis=1)
+
+
+def matmul(a: Array, b: Array) -> Array:
+    """Product of the matrices (n, k, ...) and (k, m, ...)."""
+    parts = [columns(a, i, i + 1) * rows(b, i, i + 1) for i in range(a.shape[1])]
+    return once(sum(parts[1:], parts[0]))
+
+
+def matvec(a: Array, v: Array) -> Array:
+    """Product of a matrix (n, k, ...) and a vector (k, ...)."""
+    return lax.squeeze(matmul(a, v[:, None]), (1,))
+
+
+def affine(a: Array, v: Array) -> Array:
+    """Value $A v + b$ of an affine function, with $b$ the last column of a matrix (n, k + 1,
+    ...)."""
+    size = a.shape[1] - 1
+    return matvec(columns(a, 0, size), v) + lax.squeeze(columns(a, size, size + 1), (1,))
+
+
+def transpose(a: Array) -> Array:
+    """Transposed matrix."""
+    return a.swapaxes(0, 1)
+
+
+def skew(v: Array) -> Array:
+    r"""Matrix $\tilde v$ with $\tilde v w = v \times w$."""
+    less = -v
+    x, y, z = (rows(v, i, i + 1) for i in range(3))
+    zero = jnp.zeros_like(x)
+    entries = [
+        zero, rows(less, 2, 3), y, z, zero, rows(less, 0, 1), rows(less, 1, 2), x, zero
+    ]  # fmt: skip
+    return jnp.concatenate(entries).reshape(3, 3, *v.shape[1:])
+
+
+def identity(like: Array) -> Array:
+    """The identity, of the precision of a matrix (3, 3, ...) and with as many axes."""
+    return jnp.eye(3, dtype=like.dtype).reshape(3, 3, *(1,) * (like.ndim - 2))
+
+
+def adjugate(a: Array) -> tuple[Array, Array]:
+    """Adjugate and determinant of a matrix of three rows; their quotient is the inverse."""
+    twice = jnp.concatenate([a, a])
+    twice = jnp.concatenate([twice, twice], axis=1)
+
+    def shifted(i: int, j: int) -> Array:
+        return columns(rows(twice, i, i + 3), j, j + 3)
+
+    cofactors = once(shifted(1, 1) * shifted(2, 2) - shifted(1, 2) * shifted(2, 1))
+    det = [a[0, j] * cofactors[0, j] for j in range(3)]
+    return transpose(cofactors), det[0] + det[1] + det[2]
+
+
+def trace(a: Array) -> Array:
+    """Sum of the diagonal."""
+    return a[0, 0] + a[1, 1] + a[2, 2]
