@@ -53,9 +53,8 @@ def dense(eq: Equilibrium, there: np.ndarray) -> jax.Array:
 
     def imbalance(values: jax.Array) -> jax.Array:
         xi = tuple(values.reshape(still.shape))
-        return jnp.stack(residual(xi, nodes.sections, tau, react(xi, grid, loads).wrench)).reshape(
-            -1
-        )
+        wrench = tuple(react(xi, grid, loads).wrench)
+        return jnp.stack(residual(xi, nodes.sections, tau, wrench)).reshape(-1)
 
     jacobian = jax.jacfwd(imbalance)(still.reshape(-1))
     weight = jnp.broadcast_to(grid.weight, still.shape).reshape(-1)

@@ -73,9 +73,8 @@ def dense(scene, forces, nodes):
 
     def imbalance(values):
         xi = with_locked(spread(tuple(values), free), nodes.xi, free)
-        return jnp.stack(
-            free_components(residual(xi, nodes.sections, tau, react(xi, grid, loads).wrench), free)
-        )
+        wrench = tuple(react(xi, grid, loads).wrench)
+        return jnp.stack(free_components(residual(xi, nodes.sections, tau, wrench), free))
 
     jacobian = np.asarray(jax.jit(jax.jacfwd(imbalance))(still)).reshape(still.size, still.size)
     weight = np.broadcast_to(grid.weight, still.shape).reshape(-1)

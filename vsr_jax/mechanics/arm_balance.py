@@ -22,6 +22,7 @@ from ..arm.scene import CrossSections, Scene, shared
 from ..numerics import component as c
 from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import Grid
+from ..numerics.stacked import components
 from .balance import free_components, residual, thread_direction, thread_wrench, without_force
 from .cable import Cable, cable_of, path_length
 from .friction import (
@@ -181,7 +182,7 @@ def imbalance_of(
     unknown: ArmUnknown, at: ArmState, problem: ArmProblem, kind: Kind
 ) -> ArmImbalance:
     """The residual."""
-    wrench = None if at.along is None else at.along.wrench
+    wrench = None if at.along is None else components(at.along.wrench)
     r = free_components(residual(unknown.xi, problem.sections, at.tau, wrench), kind.free)
     cables = tuple(
         cable.complementarity(tension, slack)
@@ -204,7 +205,8 @@ def _turning_rates(
         slopes[place] = -mu * turning * at.tau[place]
     change = None
     if at.along is not None and loads is not None:
-        change = reaction_rate(xi, at.along.wrench, at.along.body_density)
+        along = at.along
+        change = reaction_rate(xi, components(along.wrench), components(along.body_density))
     tau = tuple(jnp.broadcast_to(force, xi[0].shape) for force in at.tau)
     xi_rate = balanced_strain_rate(
         xi, tau, tuple(slopes), change, sections, friction.sections_rate, kind.free
@@ -254,19 +256,13 @@ def rounding_of(problem: ArmProblem) -> Array:
     for place, force in enumerate(problem.forces):
         total = total + jnp.abs(force) * largest(pull_of(sections, place, length))
     if loads is not None:
-        densities = [
-            c.scale(length, density)
-            for density in (loads.dead_density, loads.follower_density)
-            if density is not None
-        ]
-        wrenches = [part for part in (loads.dead,) if part is not None]
-        for part in (*densities, *wrenches, *(point.wrench for point in loads.follower_points)):
-            levers = sum(jnp.abs(x) for x in part[3:]) * length
-            total = total + largest(
-                shape_of(
-                    (*(jnp.abs(x) + levers for x in part[:3]), *part[3:]),
-                    sections.stiffness,
-                    length,
-                )
-            )
+        densities = (loads.dead_density, loads.follower_density)
+        wrenches = [length * density for density in densities if density is not None]
+        wrenches += [part for part in (loads.dead,) if part is not None]
+        wrenches += [point.wrench[:, None, None] for point in loads.follower_points]
+        for part in wrenches:
+            size = jnp.abs(part)
+            levers = length * jnp.sum(size[3:], axis=0)
+            wrench = (*components(size[:3] + levers), *components(size[3:]))
+            total = total + largest(shape_of(wrench, sections.stiffness, length))
     return 64 * jnp.finfo(total.dtype).eps * total

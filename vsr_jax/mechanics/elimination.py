@@ -17,6 +17,7 @@ is of the order of the distance between nodes: as a preconditioner of the exact 
 two digits per application.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -28,7 +29,7 @@ from jaxtyping import Array
 from ..numerics import component as c, stacked
 from ..numerics.component import Matrix, Vector
 from ..numerics.quadrature import Grid
-from ..numerics.stacked import affine, columns, matmul, matvec, once, rows, skew, transpose
+from ..numerics.stacked import affine, columns, matmul, matvec, once, rows, skew, transpose, turned
 from .balance import free_block, free_components, spread
 from .reaction import Loading, Reaction
 
@@ -116,7 +117,7 @@ def eliminate(
             jnp.any(jnp.isnan(x[-1]), axis=(0, 1)), UNSTABLE_SECTION, 0
         ).astype(jnp.int32)
     nodes = _nodes(c.symmetric(lower), right, xi, along, loads, grid)
-    cells, linear, local = jax.vmap(lambda *node: _cell_of(*node, free, loads.follows))(
+    cells, linear, local = jax.vmap(partial(_cell_of, free=free, follows=loads.follows))(
         nodes, _turns(nodes.rotation)
     )
     arms = nodes.weight.shape[1:]
@@ -140,26 +141,25 @@ def _nodes(
     H: Matrix, right: Vector, xi: Vector, along: Reaction, loads: Loading, grid: Grid
 ) -> _Node:
     """The nodes one after another along the arm, in the first axis."""
-    arms = jnp.broadcast_shapes(*(x.shape[2:] for x in (*right, *xi, *along.wrench, grid.weight)))
+    everything = (*right, *xi, grid.weight, *along.wrench)
+    arms = jnp.broadcast_shapes(*(x.shape[2:] for x in everything))
 
-    def listed(x: Array) -> Array:
-        """Of arrays (stages, steps, ...)."""
-        return x.swapaxes(0, 1).reshape(-1, *x.shape[2:])
+    def listed(x: Array, *shape: int) -> Array:
+        """Of an array (components, stages, steps, ...)."""
+        x = jnp.broadcast_to(x, (*x.shape[:3], *arms))
+        return jnp.moveaxis(x, (2, 1), (0, 1)).reshape(-1, *shape, *arms)
 
-    def joined(components: Vector, *shape: int) -> Array:
-        whole = [jnp.broadcast_to(x, (*x.shape[:2], *arms)) for x in components]
-        return listed(jnp.stack(whole, axis=2)).reshape(-1, *shape, *arms)
-
-    density, jumps = loads.follower_density, _jumps(along, loads, grid)
+    density, jump = loads.follower_density, _jumps(along, loads, grid)
+    rotation = along.rotation
     return _Node(
-        joined(sum(H, ()), 6, 6),
-        joined(right, 6),
-        joined(xi, 6),
-        joined(along.wrench, 6),
-        joined(sum(along.rotation, ()), 3, 3),
-        jnp.broadcast_to(listed(grid.weight), (grid.weight.size, *arms)),
-        None if density is None else joined(density, 6),
-        None if jumps is None else joined(jumps, 6),
+        listed(stacked.stack(sum(H, ())), 6, 6),
+        listed(stacked.stack(right), 6),
+        listed(stacked.stack(xi), 6),
+        listed(along.wrench, 6),
+        listed(rotation.reshape(9, *rotation.shape[2:]), 3, 3),
+        listed(grid.weight[None]),
+        None if density is None else listed(density, 6),
+        None if jump is None else listed(jump, 6),
     )
 
 
@@ -203,13 +203,13 @@ def _cell_of(
     drive = jnp.concatenate([by_theta, rows(right, 0, 3)], axis=1) - matmul(D, linear)
     compliance, stable = _inverse(once(stiff), tuple(i for i in free if i < 3))
     lever = -w * n  # moment over the cell per linear strain
-    turned = jnp.concatenate([2.0 * moment, jnp.zeros_like(right[:3])], axis=1)
+    doubled = jnp.concatenate([2.0 * moment, jnp.zeros_like(right[:3])], axis=1)
     cell = EliminationCell(
         w,
         turn,
         compliance,
         matmul(compliance, drive),
-        turned + matmul(lever, matmul(flexibility, linear)),
+        doubled + matmul(lever, matmul(flexibility, linear)),
         w * moment - matmul(lever, by_bend),
     )
     if follows:
@@ -219,15 +219,9 @@ def _cell_of(
             stretch=matmul(lever, flexibility),
             axis=rows(node.xi, 3, 6),
             force=force,
-            jump=None if jump is None else _in_body(node.rotation, jump),
+            jump=None if jump is None else turned(transpose(node.rotation), jump),
         )
     return cell, EliminatedLinear(flexibility, linear, by_bend), rigid & stable
-
-
-def _in_body(rotation: Array, wrench: Array) -> Array:
-    """A wrench (6,) of the world frame in the frame of a section."""
-    back = transpose(rotation)
-    return jnp.concatenate([matvec(back, rows(wrench, 0, 3)), matvec(back, rows(wrench, 3, 6))])
 
 
 def _per_rotation(
@@ -267,8 +261,9 @@ def _turns(R: Array) -> Array:
     return jnp.concatenate([relative, last[None]])
 
 
-def _jumps(along: Reaction, loads: Loading, grid: Grid) -> Vector | None:
-    """Follower wrenches at points in the world frame, each at the last node before it."""
+def _jumps(along: Reaction, loads: Loading, grid: Grid) -> Array | None:
+    """Follower wrenches at points in the world frame, each at the last node before it, shape (6,
+    stages, steps)."""
     total = None
     for point, wrench in zip(loads.follower_points, along.points, strict=True):
         step = jnp.arange(grid.h.shape[0]).reshape(-1, *(1,) * point.step.ndim) == point.step - 1
@@ -277,8 +272,8 @@ def _jumps(along: Reaction, loads: Loading, grid: Grid) -> Vector | None:
             .at[-1]
             .set(step.astype(grid.h.dtype))
         )
-        here = c.scale(place, wrench)
-        total = here if total is None else c.add(total, here)
+        here = place * wrench[:, None, None]
+        total = here if total is None else total + here
     return total
 
 
@@ -311,11 +306,11 @@ def _seen_from_here(P: Array, cell: EliminationCell) -> Array:
     between them."""
     parts = []
     for i in range(0, P.shape[0], 3):
-        turned = matmul(cell.turn, rows(P, i, i + 3))
-        by_theta = matmul(columns(turned, 0, 3), transpose(cell.turn))
+        seen = matmul(cell.turn, rows(P, i, i + 3))
+        by_theta = matmul(columns(seen, 0, 3), transpose(cell.turn))
         if cell.jump is not None:
             by_theta = by_theta - skew(rows(cell.jump, i, i + 3))
-        parts.append(jnp.concatenate([by_theta, columns(turned, 3, 4)], axis=1))
+        parts.append(jnp.concatenate([by_theta, columns(seen, 3, 4)], axis=1))
     return parts[0] if len(parts) == 1 else jnp.concatenate(parts)
 
 

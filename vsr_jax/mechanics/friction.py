@@ -41,7 +41,7 @@ class Friction(NamedTuple):
 def decay(turning: Array, kinks: Array | None, coefficient: Array, grid: Grid) -> Array:
     r"""Remaining share of the tension at the nodes, $e^{-\mu \varphi(X)}$, from the rates
     $\varphi'$ there and the kinks before each step."""
-    angle = jnp.sum(grid.weight * turning, axis=(0, 1)) - beyond((turning,), grid)[0]
+    angle = jnp.sum(grid.weight * turning, axis=(0, 1)) - beyond(turning[None], grid)[0]
     return jnp.exp(-coefficient * (angle if kinks is None else angle + jnp.cumsum(kinks, axis=0)))
 
 
@@ -62,7 +62,7 @@ def decay_at(
     before = jnp.append(jnp.zeros_like(through[:1]), through[:-1])
     if kinks is not None:
         before = before + jnp.cumsum(kinks)
-    return jnp.exp(-coefficient * (before[step] + within(turning, grid, step, sigma)))
+    return jnp.exp(-coefficient * (before[step] + within(turning[None], grid, step, sigma)[0]))
 
 
 def breaks_of(breakpoints: tuple[Array, ...], grid: Grid) -> Array | None:

@@ -20,8 +20,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ..arm.scene import Scene
-from ..numerics import component as c
-from ..numerics.component import Matrix, Vector
+from ..numerics.component import Vector
 from ..numerics.magnus import magnus_6
 from ..numerics.quadrature import (
     Grid,
@@ -32,21 +31,22 @@ from ..numerics.quadrature import (
     weighted,
     within,
 )
-from ..numerics.se3 import base_pose, rotation_components
+from ..numerics.se3 import base_pose, stacked_rotation
+from ..numerics.stacked import components, cross, matmul, matvec, rows, stack, transpose, turned
 
 
 class FollowerPoint(NamedTuple):
     """A wrench that follows a section: the number of steps before it, 1 at the nodes before it and
-    0 beyond, and the wrench in the body frame."""
+    0 beyond, and the wrench (6,) in the body frame."""
 
     step: Array
     before: Array
-    wrench: Vector
+    wrench: Array
 
 
 class Loading(NamedTuple):
-    r"""The loads of a scene on a grid, node arrays of shape (stages, steps); None for those that
-    are absent.
+    r"""The loads of a scene on a grid, arrays of shape (6, stages, steps); None for those that are
+    absent.
 
     - `dead`: wrench $(\sum M_i + \int c, n)$ of the world-frame loads beyond each node, known in
       advance; `dead_density`: $(c, f)$ in the world frame;
@@ -55,9 +55,9 @@ class Loading(NamedTuple):
     - `base`: pose of the base, the identity for None.
     """
 
-    dead: Vector | None
-    dead_density: Vector | None
-    follower_density: Vector | None
+    dead: Array | None
+    dead_density: Array | None
+    follower_density: Array | None
     follower_points: tuple[FollowerPoint, ...]
     base: Array | None
 
@@ -89,49 +89,50 @@ class Loading(NamedTuple):
 
 
 class Reaction(NamedTuple):
-    r"""Results of both passes.
+    r"""Results of both passes: matrices (3, 3, ...), vectors (3, ...) and wrenches (6, ...), with
+    the axes (stages, steps) of the nodes behind.
 
-    - `starts`, `rotation`: rotations at the start of each step and at the nodes.
+    - `starts`, `rotation`: rotations at the start of each step, (3, 3, steps), and at the nodes.
     - `world`, `density`: wrench $(m, n)$ in the world frame and its density $(c + p' \times n, f)$
       at the nodes.
     - `wrench`: $\Lambda$ in the body frame.
     - `axis`, `points`, `follower`: in the world frame the axis $p'$, the follower wrenches at
-      points and the follower density.
+      points (6,) and the follower density.
     - `body_density`: density (c, f) of all loads in the body frame.
     """
 
-    starts: Matrix
-    rotation: Matrix
-    world: Vector
-    density: Vector
-    wrench: Vector
-    axis: Vector
-    points: tuple[Vector, ...]
-    follower: Vector | None
-    body_density: Vector
+    starts: Array
+    rotation: Array
+    world: Array
+    density: Array
+    wrench: Array
+    axis: Array
+    points: tuple[Array, ...]
+    follower: Array | None
+    body_density: Array
 
 
 def loading(scene: Scene, grid: Grid) -> Loading | None:
     """The loads of a scene on a grid; None if it has none."""
     if not scene.loads:
         return None
-    density = scene.density(grid.X, "world")
+    dead_density, follower_density = (scene.density(grid.X, frame) for frame in ("world", "body"))
+    density = None if dead_density is None else stack(dead_density)
+    follower = None if follower_density is None else stack(follower_density)
     parts = [] if density is None else [beyond(density, grid)]
     for X, wrench in scene.point_wrenches("world"):
-        parts.append(tuple(jnp.where(grid.X < X, w, 0.0) for w in wrench))
-    dead = None
-    for part in parts:
-        dead = part if dead is None else c.add(dead, part)
+        parts.append(jnp.where(grid.X < X, stack(wrench)[:, None, None], 0.0))
+    dead = sum(parts[1:], parts[0]) if parts else None
     points = tuple(
-        FollowerPoint(jnp.sum(grid.start < X), (grid.X < X).astype(X.dtype), wrench)
+        FollowerPoint(jnp.sum(grid.start < X), (grid.X < X).astype(X.dtype), stack(wrench))
         for X, wrench in scene.point_wrenches("body")
     )
-    return Loading(dead, density, scene.density(grid.X, "body"), points, scene.rod.base)
+    return Loading(dead, density, follower, points, scene.rod.base)
 
 
-def partial_rotation(k: Vector, h: Array, sigma: Array | float) -> Vector:
+def partial_rotation(k: Array, h: Array, sigma: Array | float) -> Array:
     r"""Rotation vector from the start of a step to the fraction $\sigma$ of it, from the angular
-    strain at its nodes.
+    strain (3, stages, ...) at its nodes.
 
     The Magnus expansion of the polynomial through the nodes, $k = b_0 + b_1 x + b_2 x^2$ with x
     from -1/2 to 1/2 on the step, to the order of the steps. About the middle of the step the
@@ -139,73 +140,75 @@ def partial_rotation(k: Vector, h: Array, sigma: Array | float) -> Vector:
     at the nodes need that order too: with the first commutators alone the error at the tip of a
     loaded arm is of order 4.5 instead of 6.
     """
-    stages = k[0].shape[0]
-    near = tuple(x[stages // 2] for x in k)  # differences from it are exact, or nearly
-    through = [weighted(interpolation(stages, 0.5), x - x0) for x, x0 in zip(k, near, strict=True)]
-    b = [tuple(x[power] for x in through) for power in range(stages)]
-    b[0] = c.add(near, b[0])
+    stages = k.shape[1]
+    near = k[:, stages // 2]  # differences from it are exact, or nearly
+    b = weighted(interpolation(stages, 0.5), k - near[:, None], axis=1)
     h, middle = h * sigma, 0.5 * (sigma - 1.0)
+    first = near + b[0]
     if stages == 1:
-        return c.scale(h, b[0])
+        return h * first
     if stages == 2:
-        mean = c.scale(h, c.add(b[0], c.scale(middle, b[1])))
-        return c.add(mean, c.scale(h * sigma / 12, c.cross(mean, b[1])))
-    bend = c.scale(middle, b[2])
-    mean = c.scale(h, c.add(b[0], c.scale(middle, c.add(b[1], bend))))
-    slope = c.scale(h * sigma, c.add(b[1], c.scale(2.0, bend)))
-    return magnus_6(mean, slope, c.scale(h * sigma * sigma, b[2]), c.cross)
+        mean = h * (first + middle * b[1])
+        return mean + h * sigma / 12 * cross(mean, b[1])
+    bend = middle * b[2]
+    mean = h * (first + middle * (b[1] + bend))
+    slope = h * sigma * (b[1] + 2.0 * bend)
+    return magnus_6(mean, slope, h * sigma * sigma * b[2], cross)
 
 
-def rotations(k: Vector, h: Array, base: Array | None) -> tuple[Matrix, Matrix, Matrix]:
-    """Rotation at the start of every step, at the nodes and at the end of the arm, from the angular
-    strain at the nodes."""
+def rotations(k: Array, h: Array, base: Array | None) -> tuple[Array, Array, Array]:
+    """Rotation at the start of every step (3, 3, steps, *arms), at the nodes (3, 3, stages, steps,
+    *arms) and at the end of the arm, from the angular strain (3, stages, steps, *arms) at the
+    nodes."""
     # within each step up to its nodes, and up to its end
-    parts = jnp.append(jnp.asarray(gauss_legendre(k[0].shape[0])[0], h.dtype), 1.0)
-    within_step = rotation_components(partial_rotation(k, h, parts.reshape(-1, *(1,) * h.ndim)))
-    whole = jax.tree.map(lambda x: x[-1], within_step)
-    to_nodes = jax.tree.map(lambda x: x[:-1], within_step)
+    parts = jnp.append(jnp.asarray(gauss_legendre(k.shape[1])[0], h.dtype), 1.0)
+    within_step = stacked_rotation(
+        partial_rotation(k[:, :, None], h, parts.reshape(-1, *(1,) * h.ndim))
+    )
+    whole = jnp.moveaxis(within_step[:, :, -1], 2, 0)
     matrix = base_pose(base, h.dtype)[:3, :3]
-    first = tuple(tuple(jnp.broadcast_to(x, whole[0][0][0].shape) for x in row) for row in matrix)
-    end, starts = lax.scan(lambda R, E: (c.matmul(R, E), R), first, whole)
-    return starts, c.matmul(starts, to_nodes), end
+    first = jnp.broadcast_to(
+        matrix.reshape(3, 3, *matrix.shape[2:], *(1,) * (whole.ndim - 1 - matrix.ndim)),
+        whole.shape[1:],
+    )
+    end, starts = lax.scan(lambda R, E: (matmul(R, E), R), first, whole)
+    starts = jnp.moveaxis(starts, 0, 2)
+    return starts, matmul(starts[:, :, None], within_step[:, :, :-1]), end
 
 
 def react(xi: Vector, grid: Grid, loads: Loading) -> Reaction:
     """Reaction at the nodes for the strain `xi`, six component arrays of shape (stages, steps,
     *arms)."""
-    starts, R, end = rotations(xi[:3], grid.h, loads.base)
-    zero = (jnp.zeros_like(xi[0]),) * 3
-    m, n = (zero, zero) if loads.dead is None else (loads.dead[:3], loads.dead[3:])
-    back = c.transpose(R)
-    density = (*zero, *zero) if loads.dead_density is None else loads.dead_density
+    whole = stack(xi)
+    starts, R, end = rotations(rows(whole, 0, 3), grid.h, loads.base)
+    zero, back = jnp.zeros_like(whole), transpose(R)
+    world = zero if loads.dead is None else loads.dead
+    density = zero if loads.dead_density is None else loads.dead_density
     body_density = turned(back, density)
     points = tuple(
         turned(_rotation_at(starts, end, point.step), point.wrench)
         for point in loads.follower_points
     )
     for point, wrench in zip(loads.follower_points, points, strict=True):
-        m, n = (
-            c.add(m, c.scale(point.before, wrench[:3])),
-            c.add(n, c.scale(point.before, wrench[3:])),
-        )
+        world = world + point.before * wrench[:, None, None]
     follower = None
     if loads.follower_density is not None:
         follower = turned(R, loads.follower_density)
-        density, body_density = (
-            c.add(density, follower),
-            c.add(body_density, loads.follower_density),
-        )
-        along = beyond(follower, grid)
-        m, n = c.add(m, along[:3]), c.add(n, along[3:])
-    axis = c.matvec(R, xi[3:])
-    arm = c.cross(axis, n)
-    m = c.add(m, beyond(arm, grid))
-    density = (*c.add(density[:3], arm), *density[3:])
-    wrench = turned(back, (*m, *n))
-    return Reaction(starts, R, (*m, *n), density, wrench, axis, points, follower, body_density)
+        density, body_density = density + follower, body_density + loads.follower_density
+        world = world + beyond(follower, grid)
+    axis = matvec(R, rows(whole, 3, 6))
+    arm = cross(axis, rows(world, 3, 6))
+    world, density = _with_moment(world, beyond(arm, grid)), _with_moment(density, arm)
+    wrench = turned(back, world)
+    return Reaction(starts, R, world, density, wrench, axis, points, follower, body_density)
 
 
-def reaction_change(change: Vector, along: Reaction, grid: Grid, loads: Loading) -> Vector:
+def _with_moment(wrench: Array, moment: Array) -> Array:
+    """A wrench (6, ...) and a moment more."""
+    return jnp.concatenate([rows(wrench, 0, 3) + moment, rows(wrench, 3, 6) + 0.0 * moment])
+
+
+def reaction_change(change: Array, along: Reaction, grid: Grid, loads: Loading) -> Array:
     r"""Change $\delta\Lambda$ of the reaction with a change $(\kappa, \upsilon)$ of the strain, of
     the order of the nodes' quadrature.
 
@@ -220,28 +223,25 @@ def reaction_change(change: Vector, along: Reaction, grid: Grid, loads: Loading)
     arrays broadcast: several changes can be stacked in an axis behind those of the nodes, where the
     other arguments have size 1.
     """
-    R, m, n = along.rotation, along.world[:3], along.world[3:]
-    bend, whole = c.matvec(R, change[:3]), grid.weight
-    later = beyond(bend, grid)
-    theta = c.subtract(tuple(jnp.sum(whole * x, axis=(0, 1)) for x in bend), later)
-    zero = (jnp.zeros_like(theta[0]),) * 3
-    dm, dn = zero, zero
+    R, m, n = along.rotation, rows(along.world, 0, 3), rows(along.world, 3, 6)
+    bend, whole = matvec(R, rows(change, 0, 3)), grid.weight
+    theta = jnp.sum(whole * bend, axis=(1, 2), keepdims=True) - beyond(bend, grid)
+    delta = jnp.concatenate([jnp.zeros_like(theta)] * 2)
     for point, wrench in zip(loads.follower_points, along.points, strict=True):
-        turn = tuple(jnp.sum(whole * point.before * x, axis=(0, 1)) for x in bend)
-        dm = c.add(dm, c.scale(point.before, c.cross(turn, wrench[:3])))
-        dn = c.add(dn, c.scale(point.before, c.cross(turn, wrench[3:])))
+        turn = jnp.sum(whole * point.before * bend, axis=(1, 2), keepdims=True)
+        delta = delta + point.before * _crossed(turn, wrench[:, None, None])
     if along.follower is not None:
-        more = beyond(
-            (*c.cross(theta, along.follower[:3]), *c.cross(theta, along.follower[3:])), grid
-        )
-        dm, dn = c.add(dm, more[:3]), c.add(dn, more[3:])
-    moved = c.cross(c.add(c.cross(theta, along.axis), c.matvec(R, change[3:])), n)
+        delta = delta + beyond(_crossed(theta, along.follower), grid)
+    moved = cross(cross(theta, along.axis) + matvec(R, rows(change, 3, 6)), n)
     if loads.follows:
-        moved = c.add(moved, c.cross(along.axis, dn))
-    dm = c.add(dm, beyond(moved, grid))
-    return turned(
-        c.transpose(R), (*c.subtract(dm, c.cross(theta, m)), *c.subtract(dn, c.cross(theta, n)))
-    )
+        moved = moved + cross(along.axis, rows(delta, 3, 6))
+    dm = rows(delta, 0, 3) + beyond(moved, grid) - cross(theta, m)
+    return turned(transpose(R), jnp.concatenate([dm, rows(delta, 3, 6) - cross(theta, n)]))
+
+
+def _crossed(turn: Array, wrench: Array) -> Array:
+    """Change of a wrench (6, ...) that turns with a section."""
+    return jnp.concatenate([cross(turn, rows(wrench, 0, 3)), cross(turn, rows(wrench, 3, 6))])
 
 
 def react_at(xi: Vector, grid: Grid, loads: Loading, X: Array) -> Vector:
@@ -249,35 +249,17 @@ def react_at(xi: Vector, grid: Grid, loads: Loading, X: Array) -> Vector:
     the nodes."""
     along = react(xi, grid, loads)
     step, sigma = locate(grid, X)
-    starts = tuple(tuple(x[step] for x in row) for row in along.starts)
-    R = c.matmul(
-        starts,
-        rotation_components(
-            partial_rotation(tuple(x[:, step] for x in xi[:3]), grid.h[step], sigma)
-        ),
-    )
+    k = stack(xi[:3])[:, :, step]
+    turn = stacked_rotation(partial_rotation(k, grid.h[step], sigma))
+    R = matmul(along.starts[:, :, step], turn)
     first = float(gauss_legendre(grid.X.shape[0])[0][0])
-    world = tuple(
-        wrench[0, step] + within(q, grid, step, first) - within(q, grid, step, sigma)
-        for wrench, q in zip(along.world, along.density, strict=True)
-    )
-    return turned(c.transpose(R), world)
+    since, q = along.world[:, 0, step], along.density
+    world = since + within(q, grid, step, first) - within(q, grid, step, sigma)
+    return components(turned(transpose(R), world))
 
 
-def turned(R: Matrix, wrench: Vector) -> Vector:
-    """Moment and force of a wrench, each rotated by R."""
-    return (*c.matvec(R, wrench[:3]), *c.matvec(R, wrench[3:]))
-
-
-def _rotation_at(starts: Matrix, end: Matrix, step: Array) -> Matrix:
+def _rotation_at(starts: Array, end: Array, step: Array) -> Array:
     """Rotation at the start of a step, or at the end of the arm for the step after the last."""
-    steps = starts[0][0].shape[0]
-    here = jnp.arange(steps + 1).reshape(-1, *(1,) * step.ndim) == step
-
-    def pick(start: Array, last: Array) -> Array:
-        return jnp.sum(jnp.where(here, jnp.concatenate([start, last[None]]), 0.0), axis=0)
-
-    return tuple(
-        tuple(pick(s, e) for s, e in zip(row, last, strict=True))
-        for row, last in zip(starts, end, strict=True)
-    )
+    whole = jnp.concatenate([starts, end[:, :, None]], axis=2)
+    here = jnp.arange(whole.shape[2]).reshape(-1, *(1,) * step.ndim) == step
+    return jnp.sum(jnp.where(here, whole, 0.0), axis=2)

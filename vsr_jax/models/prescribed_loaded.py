@@ -33,6 +33,7 @@ from ..numerics.component import Forces, Vector
 from ..numerics.implicit import implicit_root
 from ..numerics.newton import LOAD_INCREMENTS, MAX_TURN, Damped, Root, damped_newton
 from ..numerics.quadrature import Grid
+from ..numerics.stacked import components, stack
 
 
 class GalerkinUnknown(NamedTuple):
@@ -121,7 +122,8 @@ def imbalance(
 ) -> GalerkinUnknown:
     """Residual: generalised force, and for each cable the smaller of tension and scaled slack
     [N]."""
-    r = residual(at.xi, problem.sections, at.tau, None if at.along is None else at.along.wrench)
+    wrench = None if at.along is None else components(at.along.wrench)
+    r = residual(at.xi, problem.sections, at.tau, wrench)
     rows = [
         cable.complementarity(tension, slack)
         for cable, tension, slack in zip(problem.cables, unknown.tension, at.slack, strict=True)
@@ -148,9 +150,8 @@ def approximate_tangent(
 
     change = c.matvec(c.symmetric(beside(tangent(at.xi, sections, at.tau))), columns)
     if at.along is not None and problem.loads is not None:
-        change = c.subtract(
-            change, reaction_change(columns, *beside((at.along, grid, problem.loads)))
-        )
+        moved = reaction_change(stack(columns), *beside((at.along, grid, problem.loads)))
+        change = c.subtract(change, components(moved))
     K = _gathered(matrix, change, grid)
     if not kind.cables:
         return K

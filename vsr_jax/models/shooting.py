@@ -30,7 +30,7 @@ from ..mechanics.friction import balanced_strain_rate, reaction_rate
 from ..numerics import component as c
 from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import Grid
-from ..numerics.se3 import base_pose, hat, rotation_components, unskew
+from ..numerics.se3 import base_pose, hat, stacked_rotation, unskew
 
 _SHOTS = 12
 """Bound on the Newton steps of the shooting; from a solution on steps they converge
@@ -206,7 +206,7 @@ class _Matching(NamedTuple):
 
 
 def _turned(R: Array, k: Array) -> Array:
-    return R @ c.join_matrix(rotation_components(c.split(k)))
+    return R @ stacked_rotation(k)
 
 
 def shoot(

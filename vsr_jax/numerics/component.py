@@ -25,17 +25,6 @@ Matrix = tuple[Vector, ...]
 Tree = TypeVar("Tree")
 
 
-def keep(tree: Tree, like: Array) -> Tree:
-    """The same values, computed once.
-
-    XLA on CPU recomputes sums and products in each of their uses, but never a division. Values with
-    many uses are therefore divided by a one that is not a constant for the compiler. `like` is any
-    array of their shape.
-    """
-    one = jnp.where(jnp.isnan(like), jnp.nan, 1.0)
-    return jax.tree.map(lambda x: x / one, tree)
-
-
 def single(tree: Tree) -> Tree:
     """The same values in single precision; integers and booleans are unchanged."""
     return cast(tree, jnp.float32)
@@ -157,13 +146,6 @@ def matmul(a: Matrix, b: Matrix) -> Matrix:
     """Product of two matrices."""
     columns = transpose(b)
     return tuple(tuple(dot(row, column) for column in columns) for row in a)
-
-
-def adjugate(matrix: Matrix) -> tuple[Matrix, Array]:
-    """Adjugate and determinant of a matrix of three rows; their quotient is the inverse."""
-    first, second, third = matrix
-    cofactors = cross(second, third), cross(third, first), cross(first, second)
-    return transpose(cofactors), dot(first, cofactors[0])
 
 
 def cholesky(lower: Matrix) -> Matrix:

@@ -49,10 +49,10 @@ def step_components(stages: tuple[Vector, ...], h: Array) -> Vector:
 
 
 def magnus_6(
-    a1: Vector, a2: Vector, a3: Vector, bracket: Callable[[Vector, Vector], Vector]
-) -> Vector:
+    a1: c.Tree, a2: c.Tree, a3: c.Tree, bracket: Callable[[c.Tree, c.Tree], c.Tree]
+) -> c.Tree:
     r"""Sixth-order Magnus expansion for the strain $(\alpha_1 + \alpha_2 x + \alpha_3 x^2) / h$, $x
-    \in [-1/2, 1/2]$ (see `step_twist`)."""
+    \in [-1/2, 1/2]$ (see `step_twist`), for component arrays or arrays."""
     c1 = bracket(a2, a1)
     c2 = c.scale(1 / 60, bracket(a1, c.add(c.scale(2.0, a3), c1)))
     left = c.add(c.subtract(c.scale(-20.0, a1), a3), c1)

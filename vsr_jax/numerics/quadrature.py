@@ -13,8 +13,6 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..typing import Scalar
-from . import component as c
-from .component import Vector
 
 
 class Grid(NamedTuple):
@@ -100,32 +98,31 @@ def merging(stages: int) -> np.ndarray:
     return np.vander(nodes, 2 * stages, increasing=True) @ through
 
 
-def weighted(weights: np.ndarray, values: Array) -> Array:
-    """Weighted sums of the values at the nodes of a step, one for weights of shape (stages,), or
-    one per row of a matrix of weights."""
-    return jnp.tensordot(jnp.asarray(weights, values.dtype), values, 1, precision="highest")
+def weighted(weights: np.ndarray, values: Array, axis: int = 0) -> Array:
+    """Weighted sums of the values at the nodes of a step, along an axis: one for weights of shape
+    (stages,), or one per row of a matrix of weights, in the first axis."""
+    return jnp.tensordot(
+        jnp.asarray(weights, values.dtype), values, (-1, axis), precision="highest"
+    )
 
 
-def beyond(density: Vector, grid: Grid) -> Vector:
+def beyond(density: Array, grid: Grid) -> Array:
     r"""Integral from each node to the end of the arm, $\int_X^L q \, ds$: exact for q of degree
     `stages - 1` in each step.
 
-    **Arguments:** `density`: component arrays $q$ at the nodes, shape (stages, steps, *arms).
+    **Arguments:** `density`: components $q$ at the nodes, shape (components, stages, steps, *arms).
     """
     stages = grid.X.shape[0]
     nodes, weights = gauss_legendre(stages)
     powers = np.arange(1, stages + 1)
     # of the integral over a step of length 1
     rest = weights - (nodes[:, None] ** powers / powers) @ interpolation(stages)
-
-    def add(total: Vector, part: Vector) -> tuple[Vector, Vector]:
-        return c.add(total, part), total
-
     # the last row is the whole step
-    sums = [weighted(np.vstack([rest, weights]), grid.h * q) for q in density]
-    parts = tuple(part[-1] for part in sums)
-    _, later = lax.scan(add, tuple(jnp.zeros_like(part[0]) for part in parts), parts, reverse=True)
-    return tuple(part[:-1] + past for part, past in zip(sums, later, strict=True))
+    sums = weighted(np.vstack([rest, weights]), grid.h * density, axis=1)
+    whole = jnp.moveaxis(sums[-1], 1, 0)
+    none = jnp.zeros_like(whole[0])
+    _, later = lax.scan(lambda total, part: (total + part, total), none, whole, reverse=True)
+    return jnp.moveaxis(sums[:-1], 0, 1) + jnp.moveaxis(later, 0, 1)[:, None]
 
 
 def locate(grid: Grid, X: Array) -> tuple[Array, Array]:
@@ -148,8 +145,8 @@ def onto(X: Array, start: Array | float, end: Array | float, slack: Array) -> tu
 
 def within(density: Array, grid: Grid, step: Array, sigma: Array | float) -> Array:
     r"""Integral from the start of a step to the fraction $\sigma$ of it of the polynomial through
-    the values at its nodes."""
+    the values at its nodes, shape (components, stages, steps)."""
     stages = grid.X.shape[0]
-    weights, q = interpolation(stages), density[:, step]
-    parts = [sigma ** (p + 1) / (p + 1) * weighted(weights[p], q) for p in range(stages)]
+    weights, q = interpolation(stages), density[:, :, step]
+    parts = [sigma ** (p + 1) / (p + 1) * weighted(weights[p], q, axis=1) for p in range(stages)]
     return grid.h[step] * sum(parts[1:], parts[0])

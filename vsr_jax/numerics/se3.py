@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..typing import Pose, Twist
-from . import component as c
+from . import component as c, stacked
 from .component import Matrix, Vector
 
 _TERMS = 14
@@ -70,12 +70,6 @@ def _stumpff_jvp(n: int, primals: tuple[Array], tangents: tuple[Array]) -> tuple
     return (first, second), tuple(-0.5 * rate * dx for rate in rates)
 
 
-def rotation_components(k: Vector) -> Matrix:
-    r"""Rotation $\exp \tilde k$ of a tuple of three component arrays, as rows of components."""
-    a, b, _ = exp_coefficients(c.dot(k, k))
-    return _rotation(k, *c.keep((a, b), k[0]))
-
-
 def _rotation(k: Vector, a: Array, b: Array) -> Matrix:
     kx, ky, kz = k
     xx, yy, zz = b * kx * kx, b * ky * ky, b * kz * kz
@@ -86,6 +80,16 @@ def _rotation(k: Vector, a: Array, b: Array) -> Matrix:
         (xy + az, 1.0 - xx - zz, yz - ax),
         (xz - ay, yz + ax, 1.0 - xx - yy),
     )
+
+
+def stacked_rotation(k: Array) -> Array:
+    r"""Rotation $\exp \tilde k = (1 - b k^2) 1 + a \tilde k + b k k^T$ of a vector (3, ...), shape
+    (3, 3, ...)."""
+    square = stacked.dot(k, k)
+    a, b, _ = exp_coefficients(square)
+    a, b = stacked.once(a), stacked.once(b)
+    diagonal = (1.0 - b * square) * stacked.identity(k[None])
+    return diagonal + a * stacked.skew(k) + (b * k)[:, None] * k[None]
 
 
 def exp_components(omega: Vector) -> tuple[Matrix, Vector]:

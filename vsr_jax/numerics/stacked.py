@@ -32,15 +32,42 @@ def columns(x: Array, start: int, end: int) -> Array:
     return lax.slice_in_dim(x, start, end, axis=1)
 
 
+def components(x: Array) -> tuple[Array, ...]:
+    """The components of the first axis, the inverse of `stack`."""
+    return tuple(lax.index_in_dim(x, i, keepdims=False) for i in range(x.shape[0]))
+
+
 def matmul(a: Array, b: Array) -> Array:
     """Product of the matrices (n, k, ...) and (k, m, ...)."""
-    parts = [columns(a, i, i + 1) * rows(b, i, i + 1) for i in range(a.shape[1])]
-    return once(sum(parts[1:], parts[0]))
+    return once(_sum(a[:, :, None] * b[None]))
 
 
 def matvec(a: Array, v: Array) -> Array:
     """Product of a matrix (n, k, ...) and a vector (k, ...)."""
-    return lax.squeeze(matmul(a, v[:, None]), (1,))
+    return _sum(a * v[None])
+
+
+def _sum(products: Array) -> Array:
+    """Sum over the second axis; a reduction of so few terms is slow in a batch."""
+    parts = [columns(products, i, i + 1) for i in range(products.shape[1])]
+    return lax.squeeze(sum(parts[1:], parts[0]), (1,))
+
+
+def turned(R: Array, wrench: Array) -> Array:
+    """Moment and force of a wrench (6, ...), each rotated by R."""
+    return jnp.concatenate([matvec(R, rows(wrench, 0, 3)), matvec(R, rows(wrench, 3, 6))])
+
+
+def dot(a: Array, b: Array) -> Array:
+    """Scalar product of two vectors."""
+    parts = components(a * b)
+    return sum(parts[1:], parts[0])
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Vector product of two vectors."""
+    a, b = jnp.concatenate([a, a]), jnp.concatenate([b, b])
+    return rows(a, 1, 4) * rows(b, 2, 5) - rows(a, 2, 5) * rows(b, 1, 4)
 
 
 def affine(a: Array, v: Array) -> Array:

@@ -34,15 +34,15 @@ from ..mechanics.balance import (
     thread_direction,
     thread_wrench,
 )
-from ..mechanics.reaction import Loading, loading, partial_rotation, react, turned
+from ..mechanics.reaction import Loading, Reaction, loading, partial_rotation, react
 from ..models.base import Nodes
-from ..numerics import component as c
+from ..numerics import component as c, stacked
 from ..numerics.component import Matrix, Vector
 from ..numerics.implicit import change_of
 from ..numerics.lanczos import Operator, extreme_pairs
-from ..numerics.magnus import step_components
 from ..numerics.quadrature import Grid, beyond, gauss_legendre
-from ..numerics.se3 import exp_coefficients, rotation_components
+from ..numerics.se3 import exp_coefficients, stacked_rotation
+from ..numerics.stacked import cross
 
 
 def extreme(scene: Scene, forces: Vector, nodes: Nodes, *, greatest: bool = False) -> Array:
@@ -97,7 +97,8 @@ class Arm(eqx.Module):
         compiles faster than that of the operator."""
 
         def imbalance(xi: Vector) -> Vector:
-            return residual(xi, self.sections, self.tau, react(xi, self.grid, self.loads).wrench)
+            wrench = stacked.components(react(xi, self.grid, self.loads).wrench)
+            return residual(xi, self.sections, self.tau, wrench)
 
         x = spread(tuple(self.units * _projected(v, self.units, self.taut)), self.free)
         return jnp.sum(self.grid.weight * c.dot(x, jax.jvp(imbalance, (self.xi,), (x,))[1]))
@@ -123,26 +124,25 @@ class _Following(NamedTuple):
 
     end: Float[Array, " steps_and_one"]
     before: Float[Array, "stages steps"]
-    wrench: Vector
+    wrench: Float[Array, "6"]
 
 
 class _Along(NamedTuple):
     r"""Linearisation of the reaction with respect to the strain, in the world frame.
 
     **Fields:** `rotation` R, `wrench` (m, n) and `axis` p' at the nodes; `follower`: density
-    (c, f) of the follower loads; `points`: follower point wrenches; `turn`, `step_turn`:
-    derivatives of the rotation of each node from the start of its step, and of each step, with
+    (c, f) of the follower loads; `points`: follower point wrenches; `turn`: derivative of the
+    rotation from the start of each step to its nodes, and in the last row of the whole step, with
     respect to the angular strains (component and stage) at the nodes of the step; `beyond`: matrix
     that takes values at the nodes to their integrals from each node to the tip.
     """
 
-    rotation: Matrix
-    wrench: Vector
-    axis: Vector
-    follower: Vector | None
+    rotation: Float[Array, "3 3 stages steps"]
+    wrench: Float[Array, "6 stages steps"]
+    axis: Float[Array, "3 stages steps"]
+    follower: Float[Array, "6 stages steps"] | None
     points: tuple[_Following, ...]
-    turn: tuple[Float[Array, "strains stages steps"], ...]
-    step_turn: tuple[Float[Array, "strains steps"], ...]
+    turn: Float[Array, "strains 3 rows steps"]
     beyond: Float[Array, "nodes nodes"]
 
 
@@ -176,7 +176,8 @@ class ScaledTangent(Operator):
 
     def _times(self, v: Array) -> Array:
         x = spread(tuple(self.units * v), self.free)
-        r = c.subtract(c.matvec(c.symmetric(self.lower), x), _reaction_change(x, self.along))
+        moved = stacked.components(_reaction_change(stacked.stack(x), self.along))
+        r = c.subtract(c.matvec(c.symmetric(self.lower), x), moved)
         return self.weight * self.units * jnp.stack(free_components(r, self.free))
 
 
@@ -219,80 +220,75 @@ def _along(xi: Vector, grid: Grid, loads: Loading) -> _Along:
     """The reaction and the derivatives that its change needs."""
     steps, size = grid.h.size, grid.X.size
     now = react(xi, grid, loads)
-    unit = jnp.eye(size, dtype=grid.h.dtype).reshape(*grid.X.shape, size)
-    (integral,) = beyond((unit,), grid._replace(h=grid.h[:, None]))
+    unit = jnp.eye(size, dtype=grid.h.dtype).reshape(1, *grid.X.shape, size)
+    (integral,) = beyond(unit, grid._replace(h=grid.h[:, None]))
     points = tuple(
         _Following((jnp.arange(steps + 1) == point.step).astype(grid.h.dtype), point.before, wrench)
         for point, wrench in zip(loads.follower_points, now.points, strict=True)
     )
-    turns = _turns(xi[:3], grid, now.starts, now.rotation)
     return _Along(
         now.rotation,
         now.world,
         now.axis,
         now.follower,
         points,
-        *turns,
+        _turns(stacked.stack(xi[:3]), grid, now),
         integral.reshape(size, size),
     )
 
 
-def _turns(k: Vector, grid: Grid, starts: Matrix, rotation: Matrix) -> tuple[Vector, Vector]:
-    """Derivatives of the rotation of the nodes from the start of their step, and of the steps, with
-    respect to each angular strain in the step."""
-    stages = grid.X.shape[0]
-    share = jnp.asarray(gauss_legendre(stages)[0], grid.h.dtype)[:, None]
+def _turns(k: Array, grid: Grid, now: Reaction) -> Array:
+    """Derivatives of the rotation from the start of each step to its nodes and to its end with
+    respect to each angular strain in the step, in the world frame."""
+    stages, dtype = grid.X.shape[0], grid.h.dtype
+    parts = jnp.append(jnp.asarray(gauss_legendre(stages)[0], dtype), 1.0)[:, None]
 
-    def vectors(*k: Array) -> tuple[Vector, Vector]:
-        zero = jnp.zeros_like(k[0][0])
-        steps = step_components(
-            tuple((*(x[i] for x in k), zero, zero, zero) for i in range(stages)), grid.h
-        )[:3]
-        return partial_rotation(k, grid.h, share), steps
+    def vectors(k: Array) -> Array:
+        return partial_rotation(k[:, :, None], grid.h, parts)
 
-    now = vectors(*k)
-    ends = c.matmul(starts, rotation_components(now[1]))
+    omega = vectors(k)
+    ends = stacked.matmul(now.starts, stacked_rotation(omega[:, -1]))
+    rotation = jnp.concatenate([now.rotation, ends[:, :, None]], axis=2)
 
-    def by_strain(unit: Array) -> tuple[Vector, Vector]:
-        change = tuple(jnp.broadcast_to(x[:, None], k[0].shape) for x in unit)
-        _, (nodes, steps) = jax.jvp(vectors, k, change)
-        return c.matvec(rotation, _turn(now[0], nodes)), c.matvec(ends, _turn(now[1], steps))
+    def by_strain(unit: Array) -> Array:
+        change = jax.jvp(vectors, (k,), (jnp.broadcast_to(unit[..., None], k.shape),))[1]
+        return stacked.matvec(rotation, _turn(omega, change))
 
-    return jax.vmap(by_strain)(jnp.eye(3 * stages, dtype=grid.h.dtype).reshape(-1, 3, stages))
+    return jax.vmap(by_strain)(jnp.eye(3 * stages, dtype=dtype).reshape(-1, 3, stages))
 
 
-def _turn(omega: Vector, change: Vector) -> Vector:
+def _turn(omega: Array, change: Array) -> Array:
     r"""Rotation $\epsilon$ in the body frame due to a change of a rotation vector,
     $\tilde\epsilon = R^T \delta R$ for $R = \exp \tilde\omega$."""
-    _, b, c3 = exp_coefficients(c.dot(omega, omega))
-    across = c.cross(omega, change)
-    return c.add(change, c.subtract(c.scale(c3, c.cross(omega, across)), c.scale(b, across)))
+    _, b, c3 = exp_coefficients(stacked.dot(omega, omega))
+    across = cross(omega, change)
+    return change + c3 * cross(omega, across) - b * across
 
 
-def _reaction_change(x: Vector, along: _Along) -> Vector:
-    r"""First-order change of the reaction $\Lambda$ due to a change of the strain."""
-    shape, steps = x[0].shape, x[0].shape[1]
-    kappa = jnp.stack(x[:3]).reshape(-1, steps)
-    before = jnp.asarray(np.triu(np.ones((steps, steps + 1)), 1), kappa.dtype)
-    starts = tuple(jnp.sum(rate * kappa, axis=0) @ before for rate in along.step_turn)
-    theta = tuple(
-        s[:-1] + jnp.sum(rate * kappa[:, None], axis=0)
-        for s, rate in zip(starts, along.turn, strict=True)
-    )
+def _reaction_change(x: Array, along: _Along) -> Array:
+    r"""First-order change of the reaction $\Lambda$ due to a change (6, stages, steps) of the
+    strain."""
+    steps = x.shape[2]
+    kappa = x[:3].reshape(-1, 1, 1, steps)
+    turns = jnp.sum(along.turn * kappa, axis=0)
+    before = jnp.asarray(np.triu(np.ones((steps, steps + 1)), 1), x.dtype)
+    starts = turns[:, -1] @ before
+    theta = starts[:, None, :-1] + turns[:, :-1]
 
-    def integral(density: Vector) -> Vector:
-        return tuple((along.beyond @ q.reshape(-1)).reshape(shape) for q in density)
+    def integral(density: Array) -> Array:
+        return (density.reshape(len(density), -1) @ along.beyond.T).reshape(density.shape)
 
     (m, n), p = (along.wrench[:3], along.wrench[3:]), along.axis
-    dm, dn = c.cross(m, theta), c.cross(n, theta)
+    dm, dn = cross(m, theta), cross(n, theta)
     for point in along.points:
-        turn = tuple(jnp.sum(point.end * s) for s in starts)
-        moment, force = c.cross(turn, point.wrench[:3]), c.cross(turn, point.wrench[3:])
-        dm, dn = c.add(dm, c.scale(point.before, moment)), c.add(dn, c.scale(point.before, force))
-    density = c.cross(c.add(c.cross(theta, p), c.matvec(along.rotation, x[3:])), n)
+        turn = jnp.sum(point.end * starts, axis=1)
+        moment, force = (cross(turn, part)[:, None, None] for part in jnp.split(point.wrench, 2))
+        dm, dn = dm + point.before * moment, dn + point.before * force
+    density = cross(cross(theta, p) + stacked.matvec(along.rotation, x[3:]), n)
     if along.follower is not None:
-        dn = c.add(dn, integral(c.cross(theta, along.follower[3:])))
-        density = c.add(density, c.cross(theta, along.follower[:3]))
+        dn = dn + integral(cross(theta, along.follower[3:]))
+        density = density + cross(theta, along.follower[:3])
     if along.follower is not None or along.points:
-        density = c.add(density, c.cross(p, c.subtract(dn, c.cross(n, theta))))
-    return turned(c.transpose(along.rotation), (*c.add(dm, integral(density)), *dn))
+        density = density + cross(p, dn - cross(n, theta))
+    moved = jnp.concatenate([dm + integral(density), dn])
+    return stacked.turned(stacked.transpose(along.rotation), moved)
