@@ -42,7 +42,8 @@ def test_follower_loads_alone_carry_the_change_of_the_force():
     follower = operations(
         vsr.Scene(ARM, [vsr.Tendon(PATH)], [vsr.TipWrench((0.0, 0.0, 0.1), frame="body")])
     )
-    assert follower["mul"] > dead["mul"] + 50
+    # products of matrices with six rows in place of three count once each
+    assert follower["mul"] > dead["mul"] + 20
 
 
 def test_only_given_lengths_solve_for_tensions(plain):

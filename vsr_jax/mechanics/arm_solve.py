@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array
 
 from ..arm.scene import CrossSections
@@ -35,10 +36,14 @@ from .balance import (
     completed,
     free_components,
     largest_force_scale,
-    solve_balance,
+    residual,
     spread,
+    strain_norm,
     with_locked,
 )
+
+_START_STEPS = 4
+"""Fixed-point steps to the start: each gains a factor of the strains that threads cause."""
 
 
 def solve_arm(problem: ArmProblem, kind: Kind, guess: ArmUnknown | None = None) -> Root:
@@ -78,18 +83,34 @@ def solve_arm(problem: ArmProblem, kind: Kind, guess: ArmUnknown | None = None) 
 
 
 def _start(problem: ArmProblem, kind: Kind) -> ArmUnknown:
-    """Balance of each section alone, without loads and friction and with slack cables, in single
-    precision."""
+    r"""Nearly the balance of each section alone, without loads and friction and with slack cables:
+    some fixed-point steps $\xi = \Sigma^{-1} B_\tau(\xi) \tau + \xi^*$, in single precision. The
+    rest strain where they do not contract."""
     tension = (jnp.zeros_like(problem.grid.h[0]),) * len(kind.cables)
     tau = problem.sections.carry(with_tensions(problem.forces, tension, kind))
-    alone = solve_balance(*c.single((problem.sections, tau)), None, kind.free)
-    sound = alone.balanced & alone.definite
-    rest = problem.sections.rest
+    sections, tau = c.single((problem.sections, tau))
+    shape = problem.grid.X.shape
+    rest = tuple(jnp.broadcast_to(x, shape) for x in sections.rest)
+
+    def closer(_: Array, state: tuple) -> tuple:
+        xi, before, _ = state
+        off = spread(free_components(residual(xi, sections, tau), kind.free), kind.free)
+        size = jnp.max(strain_norm(off, sections.stiffness))
+        step = tuple(r / s for r, s in zip(off, sections.stiffness, strict=True))
+        return c.subtract(xi, step), size, before
+
+    none = jnp.zeros((), rest[0].dtype)
+    xi, last, before = lax.fori_loop(0, _START_STEPS, closer, (rest, none, none))
+    near = last <= 0.5 * before
     xi = tuple(
-        jnp.where(sound, x.astype(x0.dtype), x0) for x, x0 in zip(alone.xi, rest, strict=True)
+        jnp.where(near, x, x0).astype(exact.dtype)
+        for x, x0, exact in zip(xi, rest, problem.sections.rest, strict=True)
     )
-    xi = with_locked(xi, rest, kind.free)
-    return ArmUnknown(xi, tension, (jnp.zeros_like(xi[0]),) * len(kind.frictional))
+    return ArmUnknown(
+        with_locked(xi, problem.sections.rest, kind.free),
+        tension,
+        (jnp.zeros_like(problem.grid.X),) * len(kind.frictional),
+    )
 
 
 class _Sizes(NamedTuple):

@@ -21,10 +21,13 @@ with $P = [-\tilde d, 1]$, is symmetric. Symbols, each a tuple of component arra
 - `tau` [N]: thread force, negative for a tendon; `reaction` $= \Lambda$ [N m, N].
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array
 
 from ..arm.routing import Path, thread_tangent
@@ -32,6 +35,7 @@ from ..arm.scene import CrossSections
 from ..numerics.component import (
     Forces,
     Matrix,
+    Tree,
     Vector,
     add,
     cholesky,
@@ -44,6 +48,9 @@ from ..numerics.component import (
 )
 from ..numerics.implicit import implicit_root
 from ..numerics.newton import Evaluation, Root, newton
+
+_LOOPED = 3
+"""Threads from which on the program loops over them: two are faster side by side."""
 
 ALL = tuple(range(6))
 """Indices of all strains."""
@@ -74,10 +81,26 @@ def thread_wrench(t: Vector, path: Path) -> Vector:
 
 def actuation_wrench(xi: Vector, sections: CrossSections, tau: Forces) -> Vector:
     """Wrench of all threads (eq. 17): $F_a = B_\\tau(\\xi) \\tau$."""
-    total = tuple(jnp.zeros_like(x) for x in xi)
-    for path, force in zip(sections.paths, tau, strict=True):
-        total = add(total, scale(force, thread_wrench(thread_direction(xi, path)[0], path)))
-    return total
+
+    def more(total: Vector, path: Path, force: Array) -> Vector:
+        return add(total, scale(force, thread_wrench(thread_direction(xi, path)[0], path)))
+
+    return _over_threads(more, tuple(jnp.zeros_like(x) for x in xi), sections, tau)
+
+
+def _over_threads(more: Callable, total: Tree, sections: CrossSections, tau: Forces) -> Tree:
+    """A total to which `more` adds the part of each thread, one after another: in a loop of the
+    program from `_LOOPED` threads on, where it compiles faster than one copy per thread."""
+    threads = tuple(zip(sections.paths, tau, strict=True))
+    if len(threads) < _LOOPED:
+        for path, force in threads:
+            total = more(total, path, force)
+        return total
+    leaves = jax.tree.leaves((total, threads))
+    shape = jnp.broadcast_shapes(*(x.shape for x in leaves))
+    total, threads = jax.tree.map(lambda x: jnp.broadcast_to(x, shape), (total, threads))
+    listed = jax.tree.map(lambda *same: jnp.stack(same), *threads)
+    return lax.scan(lambda total, thread: (more(total, *thread), None), total, listed)[0]
 
 
 def residual(
@@ -93,28 +116,29 @@ def residual(
 def tangent(xi: Vector, sections: CrossSections, tau: Forces) -> Matrix:
     """Lower triangle of the tangent stiffness (eq. 12-13): $H = \\Sigma - A$."""
     zero = jnp.zeros_like(xi[0])
-    rows = [[zero] * i + [sections.stiffness[i]] for i in range(6)]
-    for path, force in zip(sections.paths, tau, strict=True):
-        y, z = path.y, path.z
-        t, length = thread_direction(xi, path)
-        geometric = force / length
-        w = [
-            [geometric * ((1.0 if i == j else 0.0) - t[i] * t[j]) for j in range(3)]
-            for i in range(3)
-        ]
-        dw = [
-            [y * w[2][j] - z * w[1][j] for j in range(3)],
-            [z * x for x in w[0]],
-            [-y * x for x in w[0]],
-        ]  # d~ W
-        dwd = [[y * row[2] - z * row[1], z * row[0], -y * row[0]] for row in dw]  # d~ W d~^T
-        for i in range(3):
-            for j in range(i + 1):
-                rows[i][j] = rows[i][j] - dwd[i][j]
-                rows[3 + i][3 + j] = rows[3 + i][3 + j] - w[i][j]
-            for j in range(3):
-                rows[3 + i][j] = rows[3 + i][j] - dw[j][i]
-    return tuple(tuple(row) for row in rows)
+    elastic = tuple((*[zero] * i, sections.stiffness[i]) for i in range(6))
+
+    def less(lower: Matrix, path: Path, force: Array) -> Matrix:
+        return subtract(lower, _thread_stiffness(xi, path, force))
+
+    return _over_threads(less, elastic, sections, tau)
+
+
+def _thread_stiffness(xi: Vector, path: Path, force: Array) -> Matrix:
+    """Lower triangle of one thread's part of A."""
+    y, z = path.y, path.z
+    t, length = thread_direction(xi, path)
+    geometric = force / length
+    w = [[geometric * ((1.0 if i == j else 0.0) - t[i] * t[j]) for j in range(3)] for i in range(3)]
+    dw = [
+        [y * w[2][j] - z * w[1][j] for j in range(3)],
+        [z * x for x in w[0]],
+        [-y * x for x in w[0]],
+    ]  # d~ W
+    dwd = [[y * row[2] - z * row[1], z * row[0], -y * row[0]] for row in dw]  # d~ W d~^T
+    bending = [tuple(dwd[i][: i + 1]) for i in range(3)]
+    linear = [(*(dw[j][i] for j in range(3)), *w[i][: i + 1]) for i in range(3)]
+    return (*bending, *linear)
 
 
 def force_scale(stiffness: Vector) -> Array:

@@ -39,11 +39,13 @@ cables can stabilise."""
 
 
 class _Node(NamedTuple):
-    """What the elimination needs of a node: the tangent H (6, 6), the right side, the strain, the
-    reaction (6), the rotation (3, 3) and its weight; the follower density and the follower wrench
-    at the end of its cell in the world frame (6), None where there are none."""
+    """What the elimination needs of a node: the blocks of the tangent H (3, 3), the right side, the
+    strain, the reaction (6), the rotation (3, 3) and its weight; the follower density and the
+    follower wrench at the end of its cell in the world frame (6), None where there are none."""
 
-    H: Array
+    bending: Array
+    mixed: Array
+    linear: Array
     right: Array
     xi: Array
     wrench: Array
@@ -125,7 +127,7 @@ def eliminate(
     _, (X, push, negative) = lax.scan(_cell, nothing, cells, reverse=True)
 
     def forward(theta: Array, cell: tuple) -> tuple[Array, tuple[Array, Array]]:
-        X, turn, width = cell
+        X, turn, width = jax.tree.map(once, cell)
         kappa = affine(X, theta)
         return matvec(transpose(turn), theta + width * kappa), (theta, kappa)
 
@@ -144,22 +146,30 @@ def _nodes(
     everything = (*right, *xi, grid.weight, *along.wrench)
     arms = jnp.broadcast_shapes(*(x.shape[2:] for x in everything))
 
-    def listed(x: Array, *shape: int) -> Array:
-        """Of an array (components, stages, steps, ...)."""
-        x = jnp.broadcast_to(x, (*x.shape[:3], *arms))
-        return jnp.moveaxis(x, (2, 1), (0, 1)).reshape(-1, *shape, *arms)
+    def listed(x: Array) -> Array:
+        """Of an array (stages, steps, ...)."""
+        return jnp.broadcast_to(x, (*x.shape[:2], *arms)).swapaxes(0, 1).reshape(-1, *arms)
+
+    def joined(parts: Vector, *shape: int) -> Array:
+        return jnp.stack([listed(x) for x in parts], axis=1).reshape(-1, *shape, *arms)
+
+    def moved(x: Array, *shape: int) -> Array:
+        """Of an array (components, stages, steps, *arms)."""
+        return jnp.moveaxis(x, (2, 1), (0, 1)).reshape(-1, *shape, *x.shape[3:])
 
     density, jump = loads.follower_density, _jumps(along, loads, grid)
     rotation = along.rotation
     return _Node(
-        listed(stacked.stack(sum(H, ())), 6, 6),
-        listed(stacked.stack(right), 6),
-        listed(stacked.stack(xi), 6),
-        listed(along.wrench, 6),
-        listed(rotation.reshape(9, *rotation.shape[2:]), 3, 3),
-        listed(grid.weight[None]),
-        None if density is None else listed(density, 6),
-        None if jump is None else listed(jump, 6),
+        joined(sum((row[:3] for row in H[:3]), ()), 3, 3),
+        joined(sum((row[3:] for row in H[:3]), ()), 3, 3),
+        joined(sum((row[3:] for row in H[3:]), ()), 3, 3),
+        joined(right, 6),
+        joined(xi, 6),
+        moved(along.wrench, 6),
+        moved(rotation.reshape(9, *rotation.shape[2:]), 3, 3),
+        listed(grid.weight),
+        None if density is None else moved(density, 6),
+        None if jump is None else moved(jump, 6),
     )
 
 
@@ -189,11 +199,10 @@ def _cell_of(
     moment, by_force, force = _per_rotation(n, skew(rows(node.xi, 3, 6)), node.density, half)
     moment = once(half * moment)
     by_theta = moment + skew(rows(node.wrench, 0, 3))
-    bending, stretching = rows(node.H, 0, 3), rows(node.H, 3, 6)
-    flexibility, rigid = _inverse(columns(stretching, 3, 6), tuple(i - 3 for i in free if i > 2))
-    mixed = columns(bending, 3, 6) + half * n
+    flexibility, rigid = _inverse(node.linear, tuple(i - 3 for i in free if i > 2))
+    mixed = node.mixed + half * n
     D = matmul(mixed, flexibility)
-    stiff = columns(bending, 0, 3) - half * by_theta - matmul(D, transpose(mixed))
+    stiff = node.bending - half * by_theta - matmul(D, transpose(mixed))
     by_bend = transpose(D)
     if force is not None:
         stiff = stiff + matmul(D, half * force)
@@ -280,6 +289,7 @@ def _jumps(along: Reaction, loads: Loading, grid: Grid) -> Array | None:
 def _cell(end: Array, cell: EliminationCell) -> tuple[Array, tuple]:
     r"""One cell, from its end to its start: the affine change of the wrench at the start, (3, 4) or
     with follower loads (6, 4), and the affine bending $X \theta$ by the rotation at the start."""
+    cell = jax.tree.map(once, cell)  # fused with a use of theirs, slices of the scan are slow
     P = _seen_from_here(end, cell)
     width, (mean, whole) = cell.width, _carried(P, cell)
     Q = matmul(cell.compliance, mean)

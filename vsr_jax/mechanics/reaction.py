@@ -32,7 +32,17 @@ from ..numerics.quadrature import (
     within,
 )
 from ..numerics.se3 import base_pose, stacked_rotation
-from ..numerics.stacked import components, cross, matmul, matvec, rows, stack, transpose, turned
+from ..numerics.stacked import (
+    components,
+    cross,
+    matmul,
+    matvec,
+    once,
+    rows,
+    stack,
+    transpose,
+    turned,
+)
 
 
 class FollowerPoint(NamedTuple):
@@ -171,7 +181,7 @@ def rotations(k: Array, h: Array, base: Array | None) -> tuple[Array, Array, Arr
         matrix.reshape(3, 3, *matrix.shape[2:], *(1,) * (whole.ndim - 1 - matrix.ndim)),
         whole.shape[1:],
     )
-    end, starts = lax.scan(lambda R, E: (matmul(R, E), R), first, whole)
+    end, starts = lax.scan(lambda R, E: (matmul(R, once(E)), R), first, whole)
     starts = jnp.moveaxis(starts, 0, 2)
     return starts, matmul(starts[:, :, None], within_step[:, :, :-1]), end
 

@@ -101,9 +101,12 @@ def merging(stages: int) -> np.ndarray:
 def weighted(weights: np.ndarray, values: Array, axis: int = 0) -> Array:
     """Weighted sums of the values at the nodes of a step, along an axis: one for weights of shape
     (stages,), or one per row of a matrix of weights, in the first axis."""
-    return jnp.tensordot(
-        jnp.asarray(weights, values.dtype), values, (-1, axis), precision="highest"
-    )
+    rows = weights.reshape(-1, weights.shape[-1]).astype(values.dtype)
+    nodes = [lax.index_in_dim(values, i, axis, keepdims=False) for i in range(rows.shape[1])]
+    shape = (-1, *(1,) * nodes[0].ndim)
+    parts = [rows[:, i].reshape(shape) * node for i, node in enumerate(nodes)]
+    total = sum(parts[1:], parts[0])
+    return total if weights.ndim > 1 else total[0]
 
 
 def beyond(density: Array, grid: Grid) -> Array:

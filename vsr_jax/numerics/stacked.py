@@ -10,6 +10,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from . import component
+
 
 def stack(components: tuple[Array, ...], axis: int = 0) -> Array:
     """Array of components that broadcast to one shape."""
@@ -66,8 +68,7 @@ def dot(a: Array, b: Array) -> Array:
 
 def cross(a: Array, b: Array) -> Array:
     """Vector product of two vectors."""
-    a, b = jnp.concatenate([a, a]), jnp.concatenate([b, b])
-    return rows(a, 1, 4) * rows(b, 2, 5) - rows(a, 2, 5) * rows(b, 1, 4)
+    return stack(component.cross(components(a), components(b)))
 
 
 def affine(a: Array, v: Array) -> Array:
