@@ -6,8 +6,9 @@ and Newton steps of random loaded arms; of two checkouts in one run.
 Each measurement is made in a process of its own, so that nothing is compiled already. With
 `--against` another checkout of the package is measured in turn with this one, and the last column
 is the ratio of this one to it. "equations" are those of the jaxpr, with the body of a loop counted
-once; they do not depend on the machine. "one" is a solve with its tip, "gradient" its derivative by
-the inputs.
+once; they do not depend on the machine. "one" is a solve with its tip, "batch" 512 of them in one
+call, "gradient" the derivative of one by the inputs. "run_ms" is the median of the calls of one
+process.
 """
 
 import argparse
@@ -30,7 +31,7 @@ import vsr_jax as vsr
 from vsr_jax.studies import paper
 from vsr_jax.studies.timing import machine, primitives
 
-STEPS = 24
+STEPS, BATCH = 24, 512
 HERE = Path(__file__).resolve().parent.parent
 
 
@@ -61,21 +62,24 @@ def scenes() -> dict[str, tuple[vsr.Scene, Any]]:
     }
 
 
-def program(name: str, gradient: bool) -> dict[str, float]:
-    """Size and times of one program."""
+def program(name: str, kind: str) -> dict[str, float]:
+    """Size and times of one program, "one", "batch" or "gradient"."""
     scene, inputs = scenes()[name]
 
     def tip(inputs: jax.Array) -> jax.Array:
         return vsr.solve(scene, inputs, model=vsr.StrainDependent(STEPS)).tip[1, 3]
 
-    function: Callable = jax.grad(tip) if gradient else tip
+    functions: dict[str, Callable] = {"one": tip, "batch": jax.vmap(tip), "gradient": jax.grad(tip)}
+    function = functions[kind]
+    if kind == "batch":
+        inputs = jnp.linspace(0.5, 1.0, BATCH)[:, None] * inputs
     start = time.perf_counter()
     traced = jax.jit(function).trace(inputs)
     lowered, first = traced.lower(), time.perf_counter()
     compiled, second = lowered.compile(), time.perf_counter()
     jax.block_until_ready(compiled(inputs))
     runs = []
-    for _ in range(50):
+    for _ in range(15 if kind == "batch" else 50):
         begin = time.perf_counter()
         jax.block_until_ready(compiled(inputs))
         runs.append(time.perf_counter() - begin)
@@ -121,7 +125,7 @@ def measured(checkout: Path, *arguments: str) -> dict[str, float]:
 def compare(options: argparse.Namespace) -> list[dict[str, Any]]:
     """All measurements, in turn between the checkouts."""
     checkouts = {"this": HERE} | ({"other": options.against} if options.against else {})
-    jobs = [(name, kind) for name in scenes() for kind in ("one", "gradient")]
+    jobs = [(name, kind) for name in scenes() for kind in ("one", "batch", "gradient")]
     jobs += [(name, str(options.draws)) for name in STRUCTURES]
     rows = []
     for name, kind in jobs:
@@ -157,12 +161,12 @@ def main() -> None:
     if options.measure:
         name, kind = options.measure
         drawn = kind.isdigit()
-        one = newton_steps(name, int(kind)) if drawn else program(name, kind == "gradient")
+        one = newton_steps(name, int(kind)) if drawn else program(name, kind)
         print(json.dumps(one))
         return
     rows = compare(options)
     if options.json:
-        content = {"machine": machine(), "steps": STEPS, "rows": rows}
+        content = {"machine": machine(), "steps": STEPS, "batch": BATCH, "rows": rows}
         Path(options.json).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 

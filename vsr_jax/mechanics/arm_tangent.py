@@ -2,6 +2,7 @@
 elimination, and exactly by iterative refinement."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -177,40 +178,54 @@ def _units(problem: ArmProblem, kind: Kind, like: ArmImbalance) -> tuple[Array, 
     return row, change
 
 
+class _Refinement(NamedTuple):
+    """State of `_refined`: the solution and its residual; the kept directions and their images; the
+    number of steps, whether the next one checks the solution, whether that is done, and whether it
+    was accepted."""
+
+    x: Array
+    r: Array
+    directions: Array
+    images: Array
+    count: Array
+    checking: Array
+    done: Array
+    found: Array
+
+
 def _refined(apply: Callable, nearly: Callable, right: Array) -> Array:
     """Solution of a scaled system by the preconditioned generalised conjugate residual method,
     where each direction is orthogonalised against the last few.
 
     For a soft motion of the arm the approximate tangent may be ten times too stiff. Plain iterative
     refinement would then take hundreds of steps; orthogonalisation finds such a motion at once. The
-    solution is accepted by its own residual.
+    solution is accepted by its own residual, in a last step of the same loop, so that the program
+    holds the product once.
     """
     eps, size = jnp.finfo(right.dtype).eps, jnp.linalg.norm(right)
 
     def whole(x: Array) -> Array:
         return jnp.maximum(size, jnp.linalg.norm(x))
 
-    def proceed(carry: tuple) -> Array:
-        x, r, *_, count = carry
-        return (count < _REFINEMENTS) & (jnp.linalg.norm(r) > _FINAL * eps * whole(x))
-
-    def advance(carry: tuple) -> tuple:
-        x, r, P, Q, count = carry
-        p = nearly(r)
+    def advance(at: _Refinement) -> _Refinement:
+        p = jnp.where(at.checking, at.x, nearly(at.r))
         q = apply(p)
+        found = jnp.linalg.norm(right - q) <= _ACCEPTED * eps * whole(at.x)
         for _ in range(2):  # once is inexact where the remainder is small
-            share = Q @ q
-            p, q = p - share @ P, q - share @ Q
+            share = at.images @ q
+            p, q = p - share @ at.directions, q - share @ at.images
         square = q @ q
         inverse = jnp.where(square > 0, 1 / jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
         p, q = inverse * p, inverse * q
-        part = q @ r
-        place = count % _KEPT
-        return x + part * p, r - part * q, P.at[place].set(p), Q.at[place].set(q), count + 1
+        part = jnp.where(at.checking, 0.0, q @ at.r)
+        x, r, place, count = at.x + part * p, at.r - part * q, at.count % _KEPT, at.count + 1
+        refined = ~(jnp.linalg.norm(r) > _FINAL * eps * whole(x)) | (count >= _REFINEMENTS)
+        directions, images = at.directions.at[place].set(p), at.images.at[place].set(q)
+        return _Refinement(x, r, directions, images, count, refined, at.checking, found)
 
-    kept = jnp.zeros((_KEPT, *right.shape), right.dtype)
-    x, *_ = lax.while_loop(proceed, advance, (jnp.zeros_like(right), right, kept, kept, 0))
-    found = jnp.linalg.norm(right - apply(x)) <= _ACCEPTED * eps * whole(
-        x
-    )  # no derivative rather than a wrong one
-    return jnp.where(found, x, jnp.nan)
+    kept, no = jnp.zeros((_KEPT, *right.shape), right.dtype), jnp.array(False)
+    begin = _Refinement(
+        jnp.zeros_like(right), right, kept, kept, jnp.zeros((), int), ~(size > 0), no, no
+    )
+    end = lax.while_loop(lambda at: ~at.done, advance, begin)
+    return jnp.where(end.found, end.x, jnp.nan)  # no derivative rather than a wrong one

@@ -104,7 +104,7 @@ def weighted(weights: np.ndarray, values: Array, axis: int = 0) -> Array:
     rows = weights.reshape(-1, weights.shape[-1]).astype(values.dtype)
     nodes = [lax.index_in_dim(values, i, axis, keepdims=False) for i in range(rows.shape[1])]
     shape = (-1, *(1,) * nodes[0].ndim)
-    parts = [rows[:, i].reshape(shape) * node for i, node in enumerate(nodes)]
+    parts = [jnp.multiply(rows[:, i].reshape(shape), node) for i, node in enumerate(nodes)]
     total = sum(parts[1:], parts[0])
     return total if weights.ndim > 1 else total[0]
 
