@@ -187,7 +187,7 @@ class _Refinement(NamedTuple):
     r: Array
     directions: Array
     images: Array
-    count: Array
+    taken: Array
     checking: Array
     done: Array
     found: Array
@@ -218,10 +218,10 @@ def _refined(apply: Callable, nearly: Callable, right: Array) -> Array:
         inverse = jnp.where(square > 0, 1 / jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
         p, q = inverse * p, inverse * q
         part = jnp.where(at.checking, 0.0, q @ at.r)
-        x, r, place, count = at.x + part * p, at.r - part * q, at.count % _KEPT, at.count + 1
-        refined = ~(jnp.linalg.norm(r) > _FINAL * eps * whole(x)) | (count >= _REFINEMENTS)
+        x, r, place, taken = at.x + part * p, at.r - part * q, at.taken % _KEPT, at.taken + 1
+        refined = ~(jnp.linalg.norm(r) > _FINAL * eps * whole(x)) | (taken >= _REFINEMENTS)
         directions, images = at.directions.at[place].set(p), at.images.at[place].set(q)
-        return _Refinement(x, r, directions, images, count, refined, at.checking, found)
+        return _Refinement(x, r, directions, images, taken, refined, at.checking, found)
 
     kept, no = jnp.zeros((_KEPT, *right.shape), right.dtype), jnp.array(False)
     begin = _Refinement(

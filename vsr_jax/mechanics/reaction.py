@@ -215,7 +215,8 @@ def react(xi: Vector, grid: Grid, loads: Loading) -> Reaction:
 
 def _with_moment(wrench: Array, moment: Array) -> Array:
     """A wrench (6, ...) and a moment more."""
-    return jnp.concatenate([rows(wrench, 0, 3) + moment, rows(wrench, 3, 6) + 0.0 * moment])
+    total = rows(wrench, 0, 3) + moment
+    return jnp.concatenate([total, jnp.broadcast_to(rows(wrench, 3, 6), total.shape)])
 
 
 def reaction_change(change: Array, along: Reaction, grid: Grid, loads: Loading) -> Array:
