@@ -126,7 +126,7 @@ def compare(options: argparse.Namespace) -> list[dict[str, Any]]:
     """All measurements, in turn between the checkouts."""
     checkouts = {"this": HERE} | ({"other": options.against} if options.against else {})
     jobs = [(name, kind) for name in scenes() for kind in ("one", "batch", "gradient")]
-    jobs += [(name, str(options.draws)) for name in STRUCTURES]
+    jobs += [(name, str(options.draws)) for name in STRUCTURES if options.draws]
     rows = []
     for name, kind in jobs:
         taken: dict[str, list[dict[str, float]]] = {side: [] for side in checkouts}
@@ -153,7 +153,9 @@ def main() -> None:
     )
     parser.add_argument("--against", type=Path, metavar="DIR", help="another checkout")
     parser.add_argument("--rounds", type=int, default=3, help="processes per program (default: 3)")
-    parser.add_argument("--draws", type=int, default=100, help="arms per structure (default: 100)")
+    parser.add_argument(
+        "--draws", type=int, default=100, help="arms per structure (default: 100; 0: none)"
+    )
     parser.add_argument("--json", metavar="FILE", help="save the figures")
     parser.add_argument("--measure", nargs=2, help=argparse.SUPPRESS)
     options = parser.parse_args()
