@@ -100,7 +100,7 @@ def main() -> None:
     }
     take_turns(jobs.values(), options.rounds)
     equations = {
-        name: primitives(jax.make_jaxpr(function)(*args).jaxpr).total()
+        name: primitives(jax.make_jaxpr(function)(*args)).total()
         for name, (function, args, _) in programs.items()
     }
     rows = {name: job.summary() | {"equations": equations[name]} for name, job in jobs.items()}

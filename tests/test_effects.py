@@ -16,7 +16,7 @@ def operations(scene):
     """How often each primitive occurs in the solve of a scene, nested programs included."""
     values = jnp.zeros(len(scene.actuators))
     program = jax.make_jaxpr(lambda inputs: STEPS.solve(scene, inputs).state.xi)(values)
-    return primitives(program.jaxpr)
+    return primitives(program)
 
 
 @pytest.fixture(scope="module")

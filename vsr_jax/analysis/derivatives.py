@@ -17,7 +17,7 @@ from ..arm.scene import Scene
 from ..arm.scene_numbers import parameters, replaced
 from ..mechanics.balance import free_block, tangent
 from ..numerics import component as c
-from ..numerics.se3 import unskew
+from ..numerics.se3 import skew, unskew
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
 from ..typing import Pose
@@ -173,7 +173,7 @@ def _carried(g: Pose, tip: Pose) -> Float[Array, "6 6"]:
     """Matrix from a wrench on the tip, in the world's axes, to the wrench in a section's frame."""
     turned = g[:3, :3].T
     arm = tip[:3, 3] - g[:3, 3]
-    moment = jnp.concatenate([turned, turned @ c.join_matrix(c.skew(c.split(arm)))], axis=1)
+    moment = jnp.concatenate([turned, turned @ skew(arm)], axis=1)
     return jnp.concatenate([moment, jnp.concatenate([jnp.zeros_like(turned), turned], axis=1)])
 
 

@@ -85,23 +85,23 @@ def solve_arm(problem: ArmProblem, kind: Kind, guess: ArmUnknown | None = None) 
 def _start(problem: ArmProblem, kind: Kind) -> ArmUnknown:
     r"""Nearly the balance of each section alone, without loads and friction and with slack cables:
     some fixed-point steps $\xi = \Sigma^{-1} B_\tau(\xi) \tau + \xi^*$, in single precision. The
-    rest strain where they do not contract."""
+    rest strain where they do not halve the residual, on average."""
     tension = (jnp.zeros_like(problem.grid.h[0]),) * len(kind.cables)
     tau = problem.sections.carry(with_tensions(problem.forces, tension, kind))
     sections, tau = c.single((problem.sections, tau))
     shape = problem.grid.X.shape
     rest = tuple(jnp.broadcast_to(x, shape) for x in sections.rest)
 
-    def closer(_: Array, state: tuple) -> tuple:
-        xi, before, _ = state
+    def closer(i: Array, state: tuple) -> tuple:
+        xi, first, _ = state
         off = spread(free_components(residual(xi, sections, tau), kind.free), kind.free)
         size = jnp.max(strain_norm(off, sections.stiffness))
         step = tuple(r / s for r, s in zip(off, sections.stiffness, strict=True))
-        return c.subtract(xi, step), size, before
+        return c.subtract(xi, step), jnp.where(i == 0, size, first), size
 
     none = jnp.zeros((), rest[0].dtype)
-    xi, last, before = lax.fori_loop(0, _START_STEPS, closer, (rest, none, none))
-    near = last <= 0.5 * before
+    xi, first, last = lax.fori_loop(0, _START_STEPS, closer, (rest, none, none))
+    near = last <= 0.5 ** (_START_STEPS - 1) * first
     xi = tuple(
         jnp.where(near, x, x0).astype(exact.dtype)
         for x, x0, exact in zip(xi, rest, problem.sections.rest, strict=True)

@@ -39,15 +39,15 @@ cables can stabilise."""
 
 
 class _Node(NamedTuple):
-    """What the elimination needs of a node: the blocks of the tangent H (3, 3), the right side, the
-    strain, the reaction (6), the rotation (3, 3) and its weight; the follower density and the
-    follower wrench at the end of its cell in the world frame (6), None where there are none."""
+    """What the elimination needs of a node: the blocks of the tangent H (3, 3), the right side
+    (6), the axis u, the reaction (6), the rotation (3, 3) and its weight; the follower density and
+    the follower wrench at the end of its cell in the world frame (6), None where there are none."""
 
     bending: Array
     mixed: Array
     linear: Array
     right: Array
-    xi: Array
+    axis: Array
     wrench: Array
     rotation: Array
     weight: Array
@@ -164,7 +164,7 @@ def _nodes(
         joined(sum((row[3:] for row in H[:3]), ()), 3, 3),
         joined(sum((row[3:] for row in H[3:]), ()), 3, 3),
         joined(right, 6),
-        joined(xi, 6),
+        joined(xi[3:], 3),
         moved(along.wrench, 6),
         moved(rotation.reshape(9, *rotation.shape[2:]), 3, 3),
         listed(grid.weight),
@@ -196,7 +196,7 @@ def _cell_of(
     """All that does not depend on P, for one node, and whether its section is stable by itself."""
     w = node.weight
     half, n = 0.5 * w, skew(rows(node.wrench, 3, 6))
-    moment, by_force, force = _per_rotation(n, skew(rows(node.xi, 3, 6)), node.density, half)
+    moment, by_force, force = _per_rotation(n, skew(node.axis), node.density, half)
     moment = once(half * moment)
     by_theta = moment + skew(rows(node.wrench, 0, 3))
     flexibility, rigid = _inverse(node.linear, tuple(i - 3 for i in free if i > 2))
@@ -226,7 +226,7 @@ def _cell_of(
         cell = cell._replace(
             by_push=-matmul(compliance, D),
             stretch=matmul(lever, flexibility),
-            axis=rows(node.xi, 3, 6),
+            axis=node.axis,
             force=force,
             jump=None if jump is None else turned(transpose(node.rotation), jump),
         )
@@ -294,8 +294,7 @@ def _cell(end: Array, cell: EliminationCell) -> tuple[Array, tuple]:
     width, (mean, whole) = cell.width, _carried(P, cell)
     Q = matmul(cell.compliance, mean)
     if cell.by_push is not None and cell.stretch is not None:
-        Q, whole = Q + matmul(cell.by_push, P[3:]), whole + matmul(cell.stretch, P[3:])
-    Q = once(Q)
+        Q, whole = once(Q + matmul(cell.by_push, P[3:])), whole + matmul(cell.stretch, P[3:])
     pivot = stacked.identity(Q) - width * columns(Q, 0, 3)
     adjugate, det = stacked.adjugate(pivot)
     negative = _negative(stacked.trace(pivot), stacked.trace(adjugate), det)

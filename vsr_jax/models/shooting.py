@@ -31,6 +31,7 @@ from ..numerics import component as c
 from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import Grid
 from ..numerics.se3 import base_pose, hat, stacked_rotation, unskew
+from ..numerics.stacked import turned
 
 _SHOTS = 12
 """Bound on the Newton steps of the shooting; from a solution on steps they converge
@@ -149,14 +150,7 @@ def _body_density(scene: Scene, X: Array, rotation: Array) -> Vector:
     total = (jnp.zeros_like(X),) * 6
     dead, follower = scene.density(X, "world"), scene.density(X, "body")
     if dead is not None:
-        total = c.add(
-            total,
-            c.split(
-                jnp.concatenate(
-                    [rotation.T @ jnp.stack(dead[:3]), rotation.T @ jnp.stack(dead[3:])]
-                )
-            ),
-        )
+        total = c.add(total, c.split(turned(rotation.T, jnp.stack(dead))))
     return total if follower is None else c.add(total, follower)
 
 
@@ -201,8 +195,8 @@ class _Matching(NamedTuple):
         line, done, steps = integrate(
             scene, guess, control, start, h, rotation, reaction, all_of_it, self.unit
         )
-        turned = (rotation @ line.g[:3, :3]).reshape(-1)
-        return jnp.concatenate([self.unit * line.wrench, turned]), (line.g, done, steps)
+        end = (rotation @ line.g[:3, :3]).reshape(-1)
+        return jnp.concatenate([self.unit * line.wrench, end]), (line.g, done, steps)
 
 
 def _turned(R: Array, k: Array) -> Array:

@@ -126,12 +126,6 @@ def cross(a: Vector, b: Vector) -> Vector:
     )
 
 
-def skew(v: Vector) -> Matrix:
-    r"""Matrix $\tilde v$ with $\tilde v w = v \times w$."""
-    zero = jnp.zeros_like(v[0])
-    return (zero, -v[2], v[1]), (v[2], zero, -v[0]), (-v[1], v[0], zero)
-
-
 def matvec(matrix: Matrix, vector: Vector) -> Vector:
     """Product of a matrix and a vector."""
     return tuple(dot(row, vector) for row in matrix)

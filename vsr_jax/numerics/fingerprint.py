@@ -22,15 +22,16 @@ def fingerprint(function: Callable, arguments: Any, *more: Any) -> str:
         return whole(*given)
 
     program = jax.make_jaxpr(run)(arrays)
-    constants = [closed.consts for closed in _nested(program)]
+    constants = [closed.consts for closed in nested(program)]
     digest = hashlib.sha256(re.sub(r" at 0x[0-9a-f]+", "", str(program.jaxpr)).encode())
     for leaf in jax.tree.leaves((constants, arrays, more)):
         digest.update(np.asarray(leaf).tobytes())
     return digest.hexdigest()
 
 
-def _nested(program: ClosedJaxpr) -> Iterator[ClosedJaxpr]:
-    """A program and all programs that it calls, each with its own constants."""
+def nested(program: ClosedJaxpr) -> Iterator[ClosedJaxpr]:
+    """A program and all programs that it calls, the body of a loop once, each with its own
+    constants."""
     yield program
     for equation in program.jaxpr.eqns:
         for leaf in jax.tree.leaves(
@@ -39,4 +40,4 @@ def _nested(program: ClosedJaxpr) -> Iterator[ClosedJaxpr]:
             if isinstance(leaf, Jaxpr):
                 leaf = ClosedJaxpr(leaf, ())
             if isinstance(leaf, ClosedJaxpr):
-                yield from _nested(leaf)
+                yield from nested(leaf)

@@ -213,17 +213,14 @@ def damped_newton(
         if not twice:
             return x, new_step, select(go, guard, old)
         again = go & ~old.gradual & ~(taken & new.definite)
-        guard = select(again, begin._replace(gradual=~no, spent=guard.spent), guard)
+        guard = select(again, careful._replace(gradual=~careful.gradual, spent=guard.spent), guard)
         new_step = jax.tree.map(lambda s: jnp.where(again, 0.0, s).astype(s.dtype), new_step)
         return select(again, origin, x), new_step, select(go, guard, old)
 
-    no, none = jnp.zeros(floor.shape, bool), jnp.zeros(floor.shape, jnp.int32)
-    zero = jnp.zeros_like(floor)
-    damping = jnp.full_like(floor, 0.0 if increments > 1 else _MIN_DAMPING)
-    begin = _Guard(
-        zero, zero, zero + jnp.inf, ~no, zero, damping, zero + 1, no, none, no, none, none
-    )
-    first = begin._replace(applied=zero + increments, damping=zero) if twice else begin
+    careful = first = _careful(floor, increments)
+    if twice:
+        whole = jnp.full_like(floor, increments)
+        first = careful._replace(applied=whole, damping=jnp.zeros_like(floor))
     step = jax.tree.map(
         lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
         jax.eval_shape(evaluate, start, floor, floor).step,
@@ -232,6 +229,16 @@ def damped_newton(
         lambda state: jnp.any(pending(state[2])), advance, (start, step, first)
     )
     return Root(x, guard.merit <= accepted, guard.definite, guard.spent)
+
+
+def _careful(floor: Array, increments: int) -> _Guard:
+    """State of every problem before the first evaluation of the careful attempt."""
+    zero, no = jnp.zeros_like(floor), jnp.zeros(floor.shape, bool)
+    none = jnp.zeros(floor.shape, jnp.int32)
+    damping = jnp.full_like(floor, 0.0 if increments > 1 else _MIN_DAMPING)
+    return _Guard(
+        zero, zero, zero + jnp.inf, ~no, zero, damping, zero + 1, no, none, no, none, none
+    )
 
 
 def _attempt(old: _Guard, plain: Array, increments: int) -> tuple[Array, Array]:

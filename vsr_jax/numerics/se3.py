@@ -105,7 +105,7 @@ def exp_components(omega: Vector) -> tuple[Matrix, Vector]:
 
 def skew(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
     r"""Matrix $\tilde v$ with $\tilde v w = v \times w$."""
-    return c.join_matrix(c.skew(c.split(v)))
+    return stacked.skew(v)
 
 
 def unskew(matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch 3"]:

@@ -76,7 +76,7 @@ def affine(a: Array, v: Array) -> Array:
     """Value $A v + b$ of an affine function, with $b$ the last column of a matrix (n, k + 1,
     ...)."""
     size = a.shape[1] - 1
-    return matvec(columns(a, 0, size), v) + lax.squeeze(columns(a, size, size + 1), (1,))
+    return matvec(columns(a, 0, size), v) + a[:, size]
 
 
 def transpose(a: Array) -> Array:

@@ -6,27 +6,21 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable
 from functools import cached_property
-from typing import Any
 
 import jax
 import numpy as np
+from jax.extend.core import ClosedJaxpr
 from jaxtyping import PyTree
 
+from ..numerics.fingerprint import nested
 
-def primitives(jaxpr: Any) -> Counter[str]:
-    """How often each primitive occurs in a jaxpr and in all that it contains, the body of a loop
+
+def primitives(program: ClosedJaxpr) -> Counter[str]:
+    """How often each primitive occurs in a program and in all that it calls, the body of a loop
     counted once; their total is a size of the program that does not depend on the machine."""
-    counts: Counter[str] = Counter()
-    for equation in jaxpr.eqns:
-        counts[equation.primitive.name] += 1
-        for value in jax.tree.leaves(
-            list(equation.params.values()),
-            is_leaf=lambda x: hasattr(x, "jaxpr") or hasattr(x, "eqns"),
-        ):
-            inner = getattr(value, "jaxpr", value)
-            if hasattr(inner, "eqns"):
-                counts += primitives(inner)
-    return counts
+    return Counter(
+        equation.primitive.name for part in nested(program) for equation in part.jaxpr.eqns
+    )
 
 
 class Timed:
