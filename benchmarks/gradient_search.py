@@ -161,7 +161,7 @@ def drawn(made: Structure, random: np.random.Generator) -> Drawn:
     arm = _Arm(L, 0.7 * base, EI)
     threads: list[tuple[Any, float]] = [_tendon(made, i, arm, random) for i in range(2)]
     if "chamber" in on:
-        y, z = uniform(0.2, 0.6, 2) * arm.radius * random.choice([-1, 1], 2)
+        y, z = uniform(0.2, 0.5, 2) * arm.radius * random.choice([-1, 1], 2)
         area = np.pi * (uniform(0.1, 0.3) * arm.radius) ** 2
         threads.append(
             (

@@ -16,6 +16,7 @@ ROOT = pathlib.Path(__file__).parents[1]
 MOST_LINES = 30
 HEADINGS = [
     "A load",
+    "A load that depends on the pose",
     "A routing",
     "A basis",
     "A model",

@@ -28,9 +28,11 @@ def test_every_scene_adds_one_effect():
         [],
         ["length control"],
         ["friction"],
+        ["payload"],
+        ["spring"],
     ]
     assert [len(one.scene.breakpoints) for one in scenes[4:6]] == [1, 3]
-    assert [one.pose for one in scenes] == [False] + [True] * 7
+    assert [one.pose for one in scenes] == [False] + [True] * 9
 
 
 def test_timed_measures_operations_and_times():

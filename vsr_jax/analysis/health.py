@@ -16,13 +16,11 @@ from jax import lax
 from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array
 
-from ..arm.loads import Frame, Load
-from ..arm.rod import Rod
 from ..arm.scene import Scene
 from ..files.output import plain
 from ..mechanics.balance import free_components, thread_direction, thread_wrench
 from ..models.base import Model, Status
-from ..numerics.component import Wrench, norm, scale, split
+from ..numerics.component import norm, scale, split
 from ..numerics.quadrature import make_grid
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
@@ -203,29 +201,6 @@ _REMEDIES = {
 """Advice for a solve that failed."""
 
 
-class _ScaledLoad(Load):
-    """A load multiplied by a factor."""
-
-    load: Load
-    factor: Scalar
-    frame: Frame = eqx.field(static=True)
-    effect = "scaled load"
-
-    def __init__(self, load: Load, factor: Scalar):
-        self.load, self.factor, self.frame = load, factor, load.frame
-
-    def density(self, rod: Rod, X: Scalar) -> Wrench | None:
-        whole = self.load.density(rod, X)
-        return None if whole is None else scale(self.factor, whole)
-
-    def point(self, rod: Rod) -> tuple[Scalar, Wrench] | None:
-        point = self.load.point(rod)
-        return None if point is None else (point[0], scale(self.factor, point[1]))
-
-    def breakpoints(self, rod: Rod) -> tuple[Scalar, ...]:
-        return self.load.breakpoints(rod)
-
-
 def check(scene: Scene, inputs: ArrayLike | Sequence, *, model: Model | None = None) -> Health:
     """Health of one solve: stability margin, distance to failure, resolution, conditioning. Takes
     one further solve, and 64 for each of inputs and loads that the scene has.
@@ -245,7 +220,7 @@ def _check(eq: Equilibrium) -> Health:
     finer = solve(scene, inputs, model=model.finer())
 
     def status_at(of_inputs: Scalar, of_loads: Scalar) -> Array:
-        loads = tuple(_ScaledLoad(load, of_loads) for load in scene.loads)
+        loads = tuple(load.scaled(of_loads) for load in scene.loads)
         return solve(
             eqx.tree_at(lambda scene: scene.loads, scene, loads), of_inputs * inputs, model=model
         ).status

@@ -7,6 +7,14 @@ Data and their geometry only. Must not know how an equilibrium is found or how a
 from .actuator import Actuator, Chamber, Tendon, Thread
 from .loads import DistributedWrench, Frame, Gravity, Load, PointWrench, TipWrench
 from .material import Material
+from .pose_loads import (
+    MagneticDensity,
+    MagneticMoment,
+    Payload,
+    PoseLoad,
+    Spinning,
+    Spring,
+)
 from .profile import (
     Constant,
     FunctionProfile,
@@ -40,21 +48,27 @@ __all__ = [
     "Joined",
     "Linear",
     "Load",
+    "MagneticDensity",
+    "MagneticMoment",
     "Material",
     "Parallel",
     "Parameter",
+    "Payload",
     "Piecewise",
     "PointWrench",
     "Polynomial",
     "PolynomialProfile",
+    "PoseLoad",
     "Profile",
     "Rectangular",
     "Rod",
     "Routing",
     "Scene",
     "Section",
+    "Spinning",
     "Spline",
     "SplineProfile",
+    "Spring",
     "Taper",
     "Tendon",
     "Thread",

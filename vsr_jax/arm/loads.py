@@ -6,13 +6,13 @@ reference length and $(M, F)$ [N m, N] at a point. Moments are about the point o
 load acts.
 """
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..numerics.component import Vector3, Wrench, split
+from ..numerics.component import Vector3, Wrench, scale, split
 from ..typing import ArrayLike, Scalar, VectorLike
 from ..validation import choice, numbers
 from .description import Part
@@ -23,10 +23,12 @@ Frame = Literal["world", "body"]
 
 
 class Load(Part):
-    """A load on the arm: a wrench per length or a wrench at a point, in the world or body frame."""
+    """A load on the arm: a wrench per length or a wrench at a point, constant in the world frame or
+    in the body frame. One that depends on the pose of its section is a `PoseLoad`, `by_pose`."""
 
     frame: eqx.AbstractVar[Frame]
     effect: eqx.AbstractClassVar[str]
+    by_pose: ClassVar[bool] = False
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -44,9 +46,56 @@ class Load(Part):
         """Abscissa [m] and wrench $(M, F)$ of a load at a point; None for a load per length."""
         return None
 
+    def place(self, rod: Rod) -> Scalar | None:
+        """Abscissa [m] of a load at a point; None for a load per length."""
+        point = self.point(rod)
+        return None if point is None else point[0]
+
     def breakpoints(self, rod: Rod) -> tuple[Scalar, ...]:
         """Abscissas [m] where the load or a derivative of it jumps."""
         return ()
+
+    def scaled(self, factor: Scalar) -> "Load":
+        """The load times a factor."""
+        return _ScaledLoad(self, factor)
+
+
+class _ScaledLoad(Load):
+    load: Load
+    factor: Scalar
+    frame: Frame = eqx.field(static=True)
+    effect = "scaled load"
+
+    def __init__(self, load: Load, factor: Scalar):
+        self.load, self.factor, self.frame = load, factor, load.frame
+
+    def density(self, rod: Rod, X: Scalar) -> Wrench | None:
+        whole = self.load.density(rod, X)
+        return None if whole is None else scale(self.factor, whole)
+
+    def point(self, rod: Rod) -> tuple[Scalar, Wrench] | None:
+        point = self.load.point(rod)
+        return None if point is None else (point[0], scale(self.factor, point[1]))
+
+    def breakpoints(self, rod: Rod) -> tuple[Scalar, ...]:
+        return self.load.breakpoints(rod)
+
+
+def need_density(load: Load, rod: Rod) -> None:
+    """Raises `ValueError` if the material of `rod` has no density."""
+    if rod.material.density is None:
+        raise ValueError(
+            f"Scene.loads: got a {type(load).__name__} and a rod whose material has no density, "
+            "need Material(..., density=...)"
+        )
+
+
+def mass_per_length(rod: Rod, X: Scalar, displaced: Scalar | None = None) -> Scalar:
+    """Mass per reference length [kg/m], less that of a displaced fluid of a given density."""
+    assert rod.material.density is not None  # see need_density
+    density = rod.material.density(X, rod.length)
+    density = density if displaced is None else density - displaced
+    return density * rod.section.geometry(X, rod.length).area
 
 
 class Gravity(Load):
@@ -82,18 +131,10 @@ class Gravity(Load):
         return (self.effect,) if self.fluid_density is None else (self.effect, "buoyancy")
 
     def check(self, rod: Rod) -> None:
-        if rod.material.density is None:
-            raise ValueError(
-                "Scene.loads: got a Gravity and a rod whose material has no density, need "
-                "Material(..., density=...)"
-            )
+        need_density(self, rod)
 
     def density(self, rod: Rod, X: Scalar) -> Wrench:
-        assert rod.material.density is not None  # see check
-        density = rod.material.density(X, rod.length)
-        if self.fluid_density is not None:
-            density = density - self.fluid_density
-        weight = density * rod.section.geometry(X, rod.length).area
+        weight = mass_per_length(rod, X, self.fluid_density)
         zero = jnp.zeros_like(weight)
         x, y, z = (weight * g for g in self.acceleration)
         return zero, zero, zero, x, y, z
@@ -155,7 +196,7 @@ class TipWrench(Load):
         return rod.length, (*_three(self.moment), *_three(self.force))
 
 
-_NEED = "three profiles, or a function of X that returns three numbers"
+THREE_PROFILES = "three profiles, or a function of X that returns three numbers"
 
 
 class DistributedWrench(Load):
@@ -179,7 +220,7 @@ class DistributedWrench(Load):
         frame: Frame = "world",
     ):
         self.force, self.moment = (
-            as_profiles(name, value, [f"{name}[{i}]" for i in range(3)], _NEED)
+            as_profiles(name, value, [f"{name}[{i}]" for i in range(3)], THREE_PROFILES)
             for name, value in (
                 ("DistributedWrench.force", force),
                 ("DistributedWrench.moment", moment),

@@ -17,6 +17,7 @@ from ..validation import ROUNDING, concrete, instance, is_traced, numbers, preci
 from .actuator import Actuator
 from .description import Part, describe, described_arguments, table
 from .loads import Frame, Load
+from .pose_loads import PoseLoad
 from .profile import Limits
 from .rod import STRAINS, Rod
 from .routing import Path, thread_tangent
@@ -48,7 +49,8 @@ class Scene(Part):
     **Arguments:**
     - `rod`: the arm.
     - `actuators`: `Thread`, `Tendon` and `Chamber` in the order of the inputs.
-    - `loads`: `Gravity`, `TipWrench`, `PointWrench` and `DistributedWrench`.
+    - `loads`: `Gravity`, `TipWrench`, `PointWrench` and `DistributedWrench`; with the pose of
+      their section change `Spring`, `Payload`, `MagneticMoment`, `MagneticDensity` and `Spinning`.
     - `free_strains`: names of the strains that can change, all six by default. The others equal
       their rest value and are not unknowns of the solve. `("bending_y", "bending_z")` is an
       inextensible rod without twist and shear.
@@ -81,9 +83,7 @@ class Scene(Part):
         self.actuators = _each(
             "Scene.actuators", actuators, Actuator, "a Thread, Tendon or Chamber"
         )
-        self.loads = _each(
-            "Scene.loads", loads, Load, "a Gravity, TipWrench, PointWrench or DistributedWrench"
-        )
+        self.loads = _each("Scene.loads", loads, Load, "a Gravity, TipWrench, Spring or other load")
         names = (free_strains,) if isinstance(free_strains, str) else tuple(free_strains)
         if not names or any(name not in STRAINS for name in names):
             raise ValueError(
@@ -180,7 +180,7 @@ class Scene(Part):
         if there are none."""
         total = None
         for load in self.loads:
-            if load.frame != frame or load.point(self.rod) is not None:
+            if load.by_pose or load.frame != frame or load.point(self.rod) is not None:
                 continue
             here = jax.vmap(lambda x, load=load: load.density(self.rod, x) or ())(X.reshape(-1))
             here = jax.tree.map(lambda x: jnp.broadcast_to(x, X.size).reshape(X.shape), here)
@@ -189,8 +189,19 @@ class Scene(Part):
 
     def point_wrenches(self, frame: Frame) -> tuple[tuple[Scalar, Wrench], ...]:
         """Abscissa and wrench $(M, F)$ of each load of a frame that acts at a point."""
-        points = [load.point(self.rod) for load in self.loads if load.frame == frame]
+        fixed = [load for load in self.loads if not load.by_pose and load.frame == frame]
+        points = [load.point(self.rod) for load in fixed]
         return tuple(point for point in points if point is not None)
+
+    @property
+    def pose_loads(self) -> tuple[PoseLoad, ...]:
+        """The loads that depend on the pose of their section."""
+        return tuple(load for load in self.loads if isinstance(load, PoseLoad))
+
+    @property
+    def needs_positions(self) -> bool:
+        """Whether some load depends on the positions of the sections."""
+        return any(load.needs == "pose" for load in self.pose_loads)
 
     def admits(self, inputs: Float[Array, " inputs"]) -> Bool[Array, ""]:
         """Whether every input is finite and in its actuator's range."""
@@ -282,10 +293,10 @@ class Scene(Part):
                         f"arm of {length:g} m"
                     )
         for i, load in enumerate(self.loads):
-            point = load.point(self.rod)
-            if point is not None and float(point[0]) > beyond:
+            X = load.place(self.rod)
+            if X is not None and float(X) > beyond:
                 raise ValueError(
-                    f"Scene.loads[{i}].X: got {float(point[0]):g} m, need a place on the arm of "
+                    f"Scene.loads[{i}].X: got {float(X):g} m, need a place on the arm of "
                     f"{length:g} m"
                 )
 

@@ -25,6 +25,7 @@ from ..arm.actuator import Chamber, Tendon, Thread
 from ..arm.fields import arguments
 from ..arm.loads import DistributedWrench, Gravity, PointWrench, TipWrench
 from ..arm.material import Material
+from ..arm.pose_loads import MagneticDensity, MagneticMoment, Payload, Spinning, Spring
 from ..arm.profile import Constant, Piecewise, PolynomialProfile, SplineProfile, Taper
 from ..arm.rod import Rod
 from ..arm.routing import Helix, Linear, Parallel, Polynomial, Spline
@@ -53,7 +54,17 @@ _GROUPS = {
     "sections": _SECTIONS,
     "routing": _group(Parallel, Linear, Helix, Polynomial, Spline),
     "actuators": _group(Thread, Tendon, Chamber),
-    "loads": _group(Gravity, TipWrench, PointWrench, DistributedWrench),
+    "loads": _group(
+        Gravity,
+        TipWrench,
+        PointWrench,
+        DistributedWrench,
+        Spring,
+        Payload,
+        MagneticMoment,
+        MagneticDensity,
+        Spinning,
+    ),
 }
 """Classes that are possible under a key; profiles under every other key."""
 

@@ -260,6 +260,9 @@ def rounding_of(problem: ArmProblem) -> Array:
         wrenches = [length * density for density in densities if density is not None]
         wrenches += [part for part in (loads.dead,) if part is not None]
         wrenches += [point.wrench[:, None, None] for point in loads.follower_points]
+        for term in loads.by_pose:
+            size = term.size(loads.base, loads.motion)
+            wrenches.append(length * size if term.step is None else size[:, None, None])
         for part in wrenches:
             size = jnp.abs(part)
             levers = length * jnp.sum(size[3:], axis=0)

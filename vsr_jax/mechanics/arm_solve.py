@@ -14,7 +14,7 @@ from ..numerics import component as c
 from ..numerics.batching import arms_in, side_by_side
 from ..numerics.component import Vector
 from ..numerics.implicit import implicit_root
-from ..numerics.newton import LOAD_INCREMENTS, MAX_TURN, Damped, Root, damped_newton
+from ..numerics.newton import LOAD_INCREMENTS, MAX_TURN, Damped, Measures, Root, damped_newton
 from ..numerics.quadrature import Grid
 from ..typing import cast
 from .arm_balance import (
@@ -189,16 +189,15 @@ def _solve(kind: Kind, origin: ArmUnknown, guess: ArmUnknown | None, whole: ArmP
         problem = whole.with_share(share)
         at = state_of(unknown, problem, kind)
         imbalance = imbalance_of(unknown, at, problem, kind)
-        step, definite = approximate_solve(unknown, at, imbalance, problem, kind, damping)
+        step, definite, doubtful = approximate_solve(unknown, at, imbalance, problem, kind, damping)
         size = sizes.of_step(step, at)
         # A step that coils the arm may lower the residual without approaching a solution.
         cut = jnp.minimum(1.0, MAX_TURN / jnp.maximum(sizes.turn(step), MAX_TURN))
         step = jax.tree.map(lambda x: cut.astype(x.dtype) * x, step)
-        return Damped(
-            step, size, c.single(imbalance.wrench), sizes.of_imbalance(imbalance, at), definite
-        )
+        merit = sizes.of_imbalance(imbalance, at)
+        return Damped(step, size, c.single(imbalance.wrench), merit, definite, doubtful)
 
     shares = 1 if whole.loads is None else LOAD_INCREMENTS
     floor = jnp.broadcast_to(rounding_of(whole), arms)
     again = None if guess is None else origin
-    return damped_newton(evaluate, sizes.work, start, floor, shares, again)
+    return damped_newton(evaluate, Measures(sizes.work, sizes.turn), start, floor, shares, again)

@@ -16,6 +16,9 @@ from ..typing import cast
 from .arm_balance import ArmImbalance, ArmProblem, ArmState, ArmUnknown, Kind, state_of
 from .balance import free_components, spread, tangent, thread_direction, thread_wrench
 from .elimination import eliminate
+from .elimination_nodes import Definiteness
+from .pose_elimination import eliminate_poses
+from .reaction import slopes_of
 
 _REFINEMENTS = 60
 """Bound on the refinement steps of a tangent system; 5 to 10 are usual."""
@@ -34,9 +37,10 @@ def approximate_solve(
     problem: ArmProblem,
     kind: Kind,
     damping: Array | float = 0.0,
-) -> tuple[ArmUnknown, Array]:
+) -> tuple[ArmUnknown, Array, Array]:
     """Approximate solution of the tangent system (see `elimination`; the tangent of friction is
-    neglected), and whether it is definite for the changes of shape that taut cables allow.
+    neglected), whether it is definite for the changes of shape that taut cables allow, and whether
+    that is doubtful.
 
     In single precision throughout: the passes along the arm are bound by memory, and rounding is
     far below the error of the elimination.
@@ -50,12 +54,16 @@ def approximate_solve(
         (*row[:-1], row[-1] + damping * s) for row, s in zip(lower, sections.stiffness, strict=True)
     )
 
-    def solve(b: Vector) -> tuple[Vector, Array]:
-        return eliminate(lower, b, unknown.xi, at.along, problem.loads, grid, kind.free)
+    loaded = at.along is not None and problem.loads is not None
+    slopes = slopes_of(at.along, problem.loads) if loaded else None
 
-    strain, negative = solve(spread(right.wrench, kind.free))
+    def solve(b: Vector) -> tuple[Vector, Definiteness]:
+        run = eliminate_poses if slopes is not None and slopes.motion == 6 else eliminate
+        return run(lower, b, unknown.xi, at.along, slopes, grid, kind.free)
+
+    strain, (negative, doubtful) = solve(spread(right.wrench, kind.free))
     if not kind.cables:
-        return ArmUnknown(strain, (), right.turning), negative == 0
+        return ArmUnknown(strain, (), right.turning), negative == 0, doubtful
     units = [
         thread_wrench(thread_direction(unknown.xi, sections.paths[i])[0], sections.paths[i])
         for i in kind.cables
@@ -74,7 +82,7 @@ def approximate_solve(
         a - jnp.sum(tension[:, None, None] * answer, axis=0)
         for a, answer in zip(strain, answers, strict=True)
     )
-    return ArmUnknown(strain, tuple(tension), right.turning), negative == held
+    return ArmUnknown(strain, tuple(tension), right.turning), negative == held, doubtful
 
 
 def _tensions(
@@ -128,7 +136,7 @@ def tangent_solve(
     to_row, to_change = lax.stop_gradient(_units(problem, kind, right))
 
     def nearly(b: ArmImbalance) -> ArmUnknown:
-        step, _ = approximate_solve(unknown, at, b, problem, kind)
+        step, _, _ = approximate_solve(unknown, at, b, problem, kind)
         return _free_part(cast(step, problem.grid.h.dtype), kind)
 
     def scaled_apply(x: Array) -> Array:

@@ -6,9 +6,8 @@ $$n(X) = \sum_{X_i > X} F_i + \int_X^L f \, ds, \quad
 m(X) = \sum_{X_i > X} M_i + \int_X^L (c + p' \times n) \, ds, \quad
 \Lambda = (R^T m, R^T n).$$
 
-Two passes along the arm: rotations from the base to the tip, wrenches from the tip to the base. All
-loads depend on the shape through rotations only, so positions are not computed. Wrenches jump only
-at the ends of steps.
+Two passes along the arm: rotations from the base to the tip, wrenches from the tip to the base.
+Positions are computed only if a load depends on them. Wrenches jump only at the ends of steps.
 """
 
 from collections.abc import Callable
@@ -24,10 +23,12 @@ from ..numerics.component import Vector
 from ..numerics.magnus import magnus_6
 from ..numerics.quadrature import (
     Grid,
+    before,
     beyond,
     gauss_legendre,
     interpolation,
     locate,
+    sum_along,
     weighted,
     within,
 )
@@ -39,10 +40,12 @@ from ..numerics.stacked import (
     matvec,
     once,
     rows,
+    skew,
     stack,
     transpose,
     turned,
 )
+from .pose_terms import PoseTerm, finite, pose_terms
 
 
 class FollowerPoint(NamedTuple):
@@ -62,6 +65,7 @@ class Loading(NamedTuple):
       advance; `dead_density`: $(c, f)$ in the world frame;
     - `follower_density`: $(c, f)$ in the body frame; `follower_points`: wrenches at points in the
       body frame;
+    - `by_pose`: loads that depend on the pose of their section;
     - `base`: pose of the base, the identity for None.
     """
 
@@ -69,12 +73,17 @@ class Loading(NamedTuple):
     dead_density: Array | None
     follower_density: Array | None
     follower_points: tuple[FollowerPoint, ...]
+    by_pose: tuple[PoseTerm, ...]
     base: Array | None
 
     @property
-    def follows(self) -> bool:
-        """Whether a load rotates with the arm."""
-        return self.follower_density is not None or bool(self.follower_points)
+    def motion(self) -> int:
+        """Size of the motions of sections by which wrenches in the world frame change: 0 for dead
+        loads, 3 (rotation) or 6 (and displacement)."""
+        if any(term.load.needs == "pose" for term in self.by_pose):
+            return 6
+        turns = self.by_pose or self.follower_points or self.follower_density is not None
+        return 3 if turns else 0
 
     def scaled(self, share: Array) -> "Loading":
         """A fraction of all loads."""
@@ -82,7 +91,10 @@ class Loading(NamedTuple):
 
     def absent(self) -> "Loading":
         """Zero in place of all loads."""
-        return self._mapped(jnp.zeros_like)
+        terms = tuple(
+            term._replace(load=finite(term.load), rod=finite(term.rod)) for term in self.by_pose
+        )
+        return self._replace(by_pose=terms)._mapped(jnp.zeros_like)
 
     def _mapped(self, function: Callable[[Array], Array]) -> "Loading":
         """A function of every component of the loads."""
@@ -95,6 +107,7 @@ class Loading(NamedTuple):
             dead_density=jax.tree.map(function, self.dead_density),
             follower_density=jax.tree.map(function, self.follower_density),
             follower_points=points,
+            by_pose=tuple(term._replace(share=function(term.share)) for term in self.by_pose),
         )
 
 
@@ -109,6 +122,7 @@ class Reaction(NamedTuple):
     - `axis`, `points`, `follower`: in the world frame the axis $p'$, the follower wrenches at
       points (6,) and the follower density.
     - `body_density`: density (c, f) of all loads in the body frame.
+    - `seen`: rotation and position where each load acts that depends on the pose.
     """
 
     starts: Array
@@ -120,6 +134,30 @@ class Reaction(NamedTuple):
     points: tuple[Array, ...]
     follower: Array | None
     body_density: Array
+    seen: tuple[tuple[Array, Array | None], ...]
+
+
+class PointSlope(NamedTuple):
+    """Derivative (6, motion) of a wrench at a point with respect to the motion of its section; the
+    steps and nodes before it as for `FollowerPoint`."""
+
+    step: Array
+    before: Array
+    matrix: Array
+
+
+class Slopes(NamedTuple):
+    """Derivatives of the loads in the world frame with respect to motions of their sections: of the
+    density (6, motion, stages, steps), None if it is constant, and of the wrenches at points."""
+
+    density: Array | None
+    points: tuple[PointSlope, ...]
+
+    @property
+    def motion(self) -> int:
+        """Size of the motions, see `Loading.motion`."""
+        matrices = [x for x in (self.density, *(p.matrix for p in self.points)) if x is not None]
+        return matrices[0].shape[1] if matrices else 0
 
 
 def loading(scene: Scene, grid: Grid) -> Loading | None:
@@ -137,7 +175,7 @@ def loading(scene: Scene, grid: Grid) -> Loading | None:
         FollowerPoint(jnp.sum(grid.start < X), (grid.X < X).astype(X.dtype), stack(wrench))
         for X, wrench in scene.point_wrenches("body")
     )
-    return Loading(dead, density, follower, points, scene.rod.base)
+    return Loading(dead, density, follower, points, pose_terms(scene, grid), scene.rod.base)
 
 
 def partial_rotation(k: Array, h: Array, sigma: Array | float) -> Array:
@@ -207,10 +245,60 @@ def react(xi: Vector, grid: Grid, loads: Loading) -> Reaction:
         density, body_density = density + follower, body_density + loads.follower_density
         world = world + beyond(follower, grid)
     axis = matvec(R, rows(whole, 3, 6))
+    seen = _seen(starts, end, R, axis, grid, loads)
+    for term, (turn, place) in zip(loads.by_pose, seen, strict=True):
+        here = term.wrench(turn, place)
+        if term.before is None:
+            density, body_density = density + here, body_density + turned(back, here)
+            world = world + beyond(here, grid)
+        else:
+            world = world + term.before * here[:, None, None]
     arm = cross(axis, rows(world, 3, 6))
     world, density = _with_moment(world, beyond(arm, grid)), _with_moment(density, arm)
     wrench = turned(back, world)
-    return Reaction(starts, R, world, density, wrench, axis, points, follower, body_density)
+    return Reaction(starts, R, world, density, wrench, axis, points, follower, body_density, seen)
+
+
+def _seen(
+    starts: Array, end: Array, R: Array, axis: Array, grid: Grid, loads: Loading
+) -> tuple[tuple[Array, Array | None], ...]:
+    """Rotation and position where each load acts that depends on the pose; None for positions if no
+    load depends on them."""
+    positions = loads.motion == 6
+    base = jnp.asarray(base_pose(loads.base, grid.h.dtype))[:3, 3]
+    base = base.reshape(3, 1, 1, *base.shape[1:], *(1,) * (axis.ndim - 2 - base.ndim))
+    along = any(term.step is None for term in loads.by_pose)
+    nodes = base + before(axis, grid) if positions and along else None
+    seen = []
+    for term in loads.by_pose:
+        if term.step is None or term.before is None:
+            seen.append((R, nodes))
+        else:
+            place = (base + sum_along(term.before * axis, grid))[:, 0, 0] if positions else None
+            seen.append((_rotation_at(starts, end, term.step), place))
+    return tuple(seen)
+
+
+def slopes_of(along: Reaction, loads: Loading) -> Slopes:
+    """Derivatives of the loads with respect to motions of size `loads.motion`."""
+    size, density, points = loads.motion, None, []
+    if along.follower is not None:
+        density = _turning(along.follower, size)
+    for point, wrench in zip(loads.follower_points, along.points, strict=True):
+        points.append(PointSlope(point.step, point.before, _turning(wrench, size)))
+    for term, (turn, place) in zip(loads.by_pose, along.seen, strict=True):
+        here = term.slope(turn, place, size)
+        if term.step is not None and term.before is not None:
+            points.append(PointSlope(term.step, term.before, here))
+        else:
+            density = here if density is None else density + here
+    return Slopes(density, tuple(points))
+
+
+def _turning(wrench: Array, size: int) -> Array:
+    """Derivative (6, size, ...) of a wrench that turns with its section."""
+    turn = jnp.concatenate([-skew(rows(wrench, 0, 3)), -skew(rows(wrench, 3, 6))])
+    return turn if size == 3 else jnp.concatenate([turn, jnp.zeros_like(turn)], axis=1)
 
 
 def _with_moment(wrench: Array, moment: Array) -> Array:
@@ -219,40 +307,38 @@ def _with_moment(wrench: Array, moment: Array) -> Array:
     return jnp.concatenate([total, jnp.broadcast_to(rows(wrench, 3, 6), total.shape)])
 
 
-def reaction_change(change: Array, along: Reaction, grid: Grid, loads: Loading) -> Array:
+def reaction_change(change: Array, along: Reaction, slopes: Slopes, grid: Grid) -> Array:
     r"""Change $\delta\Lambda$ of the reaction with a change $(\kappa, \upsilon)$ of the strain, of
     the order of the nodes' quadrature.
 
-    With the rotation $\theta(X) = \int_0^X R \kappa \, ds$ of the sections in the world frame
+    With the rotation $\theta(X) = \int_0^X R \kappa \, ds$ of the sections in the world frame,
+    their displacement $\rho$ with $\rho' = \theta \times p' + R \upsilon$, and the changes
+    $\delta c$, $\delta f$ of the loads by their `slopes`
 
-    $$\delta n = \int_X^L \theta \times f \, ds, \quad
-    \delta m = \int_X^L ((\theta \times p' + R \upsilon) \times n + p' \times \delta n + \theta
-    \times c) \, ds, \quad \delta\Lambda = R^T (\delta m - \theta \times m, \delta n - \theta \times
-    n),$$
+    $$\delta n = \int_X^L \delta f \, ds, \quad
+    \delta m = \int_X^L (\rho' \times n + p' \times \delta n + \delta c) \, ds, \quad
+    \delta\Lambda = R^T (\delta m - \theta \times m, \delta n - \theta \times n);$$
 
-    where c and f are the follower densities; follower points add $\theta \times F$ before them. All
-    arrays broadcast: several changes can be stacked in an axis behind those of the nodes, where the
-    other arguments have size 1.
+    wrenches at points add their changes before them. All arrays broadcast: several changes can be
+    stacked in an axis behind those of the nodes, where the other arguments have size 1.
     """
     R, m, n = along.rotation, rows(along.world, 0, 3), rows(along.world, 3, 6)
-    bend, whole = matvec(R, rows(change, 0, 3)), grid.weight
-    theta = jnp.sum(whole * bend, axis=(1, 2), keepdims=True) - beyond(bend, grid)
+    bend = matvec(R, rows(change, 0, 3))
+    theta = before(bend, grid)
+    moving = cross(theta, along.axis) + matvec(R, rows(change, 3, 6))
     delta = jnp.concatenate([jnp.zeros_like(theta)] * 2)
-    for point, wrench in zip(loads.follower_points, along.points, strict=True):
-        turn = jnp.sum(whole * point.before * bend, axis=(1, 2), keepdims=True)
-        delta = delta + point.before * _crossed(turn, wrench[:, None, None])
-    if along.follower is not None:
-        delta = delta + beyond(_crossed(theta, along.follower), grid)
-    moved = cross(cross(theta, along.axis) + matvec(R, rows(change, 3, 6)), n)
-    if loads.follows:
+    motion = jnp.concatenate([bend, moving]) if slopes.motion == 6 else bend
+    for point in slopes.points:
+        there = sum_along(point.before * motion, grid)
+        delta = delta + point.before * matvec(point.matrix[:, :, None, None], there)
+    if slopes.density is not None:
+        here = jnp.concatenate([theta, before(moving, grid)]) if slopes.motion == 6 else theta
+        delta = delta + beyond(matvec(slopes.density, here), grid)
+    moved = cross(moving, n)
+    if slopes.motion:
         moved = moved + cross(along.axis, rows(delta, 3, 6))
     dm = rows(delta, 0, 3) + beyond(moved, grid) - cross(theta, m)
     return turned(transpose(R), jnp.concatenate([dm, rows(delta, 3, 6) - cross(theta, n)]))
-
-
-def _crossed(turn: Array, wrench: Array) -> Array:
-    """Change of a wrench (6, ...) that turns with a section."""
-    return jnp.concatenate([cross(turn, rows(wrench, 0, 3)), cross(turn, rows(wrench, 3, 6))])
 
 
 def react_at(xi: Vector, grid: Grid, loads: Loading, X: Array) -> Vector:

@@ -246,9 +246,9 @@ def _shoot(model: Continuum, scene: Scene, inputs: Array) -> tuple[Shot, Guess, 
     loads = loading(scene, grid)
     zero = jnp.zeros_like(segments.start)
     wrench = (zero,) * 6 if loads is None else react_at(found.state.xi, grid, loads, segments.start)
-    first = ShootingUnknown(
-        steps.poses(scene, found.forces, found.state, segments.start)[:, :3, :3], c.join(wrench)
-    )
+    poses = steps.poses(scene, found.forces, found.state, segments.start)
+    position = poses[:, :3, 3] if scene.needs_positions else None
+    first = ShootingUnknown(poses[:, :3, :3], c.join(wrench), position)
     control = model._control(grid.h.dtype)
     shot = shoot(scene, guess, first, segments, control, _ALLOWED * max(control.rtol, control.atol))
     failed = jnp.where(found.status == Status.CONVERGED, Status.NOT_CONVERGED, found.status)
@@ -268,9 +268,9 @@ def _line_of_shot(model: Continuum, scene: Scene, inputs: Array, X: Array) -> Li
     unit = wrench_scale(scene, shot.unknown.reaction)
 
     def at(j: Array, part: Array) -> Line:
-        rotation, reaction = shot.unknown.rotation[j], shot.unknown.reaction[j]
+        begin = jax.tree.map(lambda x: x[j], shot.unknown)
         line, _, _ = integrate(
-            scene, guess, control, segments.start[j], segments.h[j], rotation, reaction, part, unit
+            scene, guess, control, segments.start[j], segments.h[j], begin, part, unit
         )
         return Line(line.xi, shot.poses[j] @ line.g)
 

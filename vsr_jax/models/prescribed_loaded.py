@@ -26,14 +26,18 @@ from ..mechanics.balance import (
 )
 from ..mechanics.cable import path_length
 from ..mechanics.friction import kinks_of, share_left, turning_rate
-from ..mechanics.reaction import Reaction, react, reaction_change
+from ..mechanics.reaction import Reaction, react, reaction_change, slopes_of
 from ..numerics import component as c, lu
 from ..numerics.batching import arms_in, side_by_side
 from ..numerics.component import Forces, Vector
 from ..numerics.implicit import implicit_root
-from ..numerics.newton import LOAD_INCREMENTS, MAX_TURN, Damped, Root, damped_newton
+from ..numerics.newton import LOAD_INCREMENTS, MAX_TURN, Damped, Measures, Root, damped_newton
 from ..numerics.quadrature import Grid
 from ..numerics.stacked import components, stack
+
+_ASYMMETRIC = 0.2
+"""Asymmetry of two coordinates of the tangent, as a fraction of their elastic stiffness, above
+which its pivots may miss a pair of negative eigenvalues."""
 
 
 class GalerkinUnknown(NamedTuple):
@@ -150,7 +154,8 @@ def approximate_tangent(
 
     change = c.matvec(c.symmetric(beside(tangent(at.xi, sections, at.tau))), columns)
     if at.along is not None and problem.loads is not None:
-        moved = reaction_change(stack(columns), *beside((at.along, grid, problem.loads)))
+        slopes = slopes_of(at.along, problem.loads)
+        moved = reaction_change(stack(columns), *beside((at.along, slopes, grid)))
         change = c.subtract(change, components(moved))
     K = _gathered(matrix, change, grid)
     if not kind.cables:
@@ -277,6 +282,8 @@ def _solve(kind: Kind, basis: NodalBasis, problem: ArmProblem) -> Root:
     sizes = _sizes_of(basis, K, problem, kind)
     size = K.shape[0]
 
+    elastic = c.single(jnp.diagonal(K).T if K.ndim == 2 else jnp.moveaxis(jnp.diagonal(K), -1, 0))
+
     def evaluate(unknown: GalerkinUnknown, damping: Array, share: Array) -> Damped:
         part = problem.with_share(share)
         at = state_of(unknown, basis, part, kind)
@@ -291,17 +298,26 @@ def _solve(kind: Kind, basis: NodalBasis, problem: ArmProblem) -> Root:
             lu.diagonal(factors) <= 0
         )  # taut cables prevent as many unstable motions as their own rows have negative pivots
         definite = jnp.sum(falling[:size], axis=0) == jnp.sum(falling[size:], axis=0)
+        size_of = jnp.sqrt(elastic[:, None] * elastic[None])
+        apart = jnp.abs(J - J.swapaxes(0, 1))[:size, :size] > _ASYMMETRIC * size_of
         return Damped(
-            jax.tree.map(lambda x: cut * x, step), moved, r.q, sizes.of_imbalance(r), definite
+            jax.tree.map(lambda x: cut * x, step),
+            moved,
+            r.q,
+            sizes.of_imbalance(r),
+            definite,
+            jnp.any(apart, axis=(0, 1)),
         )
 
     def work(force: Array, step: GalerkinUnknown) -> Array:
         return jnp.sum(force * step.q, axis=0)
 
+    def turn(step: GalerkinUnknown) -> Array:
+        return sizes.turn(step.q)
+
     start = GalerkinUnknown(
         jnp.zeros((size, *arms), K.dtype), jnp.zeros((len(kind.cables), *arms), K.dtype)
     )
     floor = jnp.broadcast_to(rounding_of(problem), arms)
-    return damped_newton(
-        evaluate, work, start, floor, 1 if problem.loads is None else LOAD_INCREMENTS
-    )
+    shares = 1 if problem.loads is None else LOAD_INCREMENTS
+    return damped_newton(evaluate, Measures(work, turn), start, floor, shares)

@@ -71,7 +71,7 @@ def corrected_strain(
 
     def correct(_: Array, unknown: ArmUnknown) -> ArmUnknown:
         at = state_of(unknown, problem, kind)
-        step, _ = approximate_solve(
+        step, _, _ = approximate_solve(
             unknown, at, imbalance_of(unknown, at, problem, kind), problem, kind
         )
         return c.subtract(unknown, cast(step, xi[0].dtype))

@@ -11,10 +11,11 @@ starting from $\Lambda = r(\xi)$. All three are integrated: the reaction that fo
 strain of a slender arm would be the small difference of large numbers. The rotation is known at the
 base and the reaction at the tip. Single shooting over a long soft arm is ill-conditioned, so the
 arm is divided into segments, also at its breakpoints. The unknowns are the rotation and the
-reaction at the start of each segment, continuous except for point loads. The initial guess is a
-solution on steps.
+reaction at the start of each segment, continuous except for point loads, and the position if a load
+depends on it. The initial guess is a solution on steps.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax
@@ -56,10 +57,12 @@ class Guess(NamedTuple):
 
 
 class ShootingUnknown(NamedTuple):
-    """Rotation (3, 3) and reaction (6,) at the start of each segment."""
+    """Rotation (3, 3), reaction (6,) and position (3,) at the start of each segment; None for the
+    positions if no load depends on them."""
 
     rotation: Array
     reaction: Array
+    position: Array | None
 
 
 class SegmentState(NamedTuple):
@@ -98,14 +101,13 @@ def integrate(
     control: Control,
     start: Array,
     h: Array,
-    rotation: Array,
-    reaction: Array,
+    begin: ShootingUnknown,
     part: Array,
     unit: Array,
 ) -> tuple[SegmentState, Array, Array]:
     """State at a fraction `part` of a segment, whether diffrax succeeded, and its steps; reactions
     are measured in `unit`, their scale."""
-    free, inside = scene.free, _inside(h.dtype)
+    free, inside, (rotation, reaction, position) = scene.free, _inside(h.dtype), begin
 
     def at(t: Array) -> tuple[Array, CrossSections, Vector]:
         x = start + h * (inside + (1 - 2 * inside) * t)
@@ -117,7 +119,8 @@ def integrate(
         per_length = jnp.where(h > 0, h, 1.0)
         rate = jax.tree.map(lambda v: v / per_length, rate)
         xi = c.split(line.xi)
-        density = _body_density(scene, x, rotation @ line.g[:3, :3])
+        place = None if position is None else position + rotation @ line.g[:3, 3]
+        density = _body_density(scene, x, rotation @ line.g[:3, :3], place)
         change = reaction_rate(xi, c.split(unit * line.wrench), density)
         xi_rate = balanced_strain_rate(xi, tau, rate[2], change, sections, rate[1], free)
         return SegmentState(
@@ -145,18 +148,21 @@ def integrate(
     return line, completed, solution.stats["num_steps"].astype(jnp.int32)
 
 
-def _body_density(scene: Scene, X: Array, rotation: Array) -> Vector:
+def _body_density(scene: Scene, X: Array, rotation: Array, position: Array | None) -> Vector:
     """Density (c, f) of all loads in the body frame."""
-    total = (jnp.zeros_like(X),) * 6
     dead, follower = scene.density(X, "world"), scene.density(X, "body")
-    if dead is not None:
-        total = c.add(total, c.split(turned(rotation.T, jnp.stack(dead))))
+    world = jnp.zeros((6,), X.dtype) if dead is None else jnp.stack(dead)
+    place = jnp.zeros((3,), X.dtype) if position is None else position
+    for load in scene.pose_loads:
+        if load.place(scene.rod) is None:
+            world = world + load.wrench(scene.rod, X, rotation, place)
+    total = c.split(turned(rotation.T, world))
     return total if follower is None else c.add(total, follower)
 
 
 class _Matching(NamedTuple):
     """The equations of the shooting: z holds for each segment the rotation vector by which its
-    start is turned from the first guess, and the change of its reaction."""
+    start is turned from the first guess, and the changes of its reaction and position."""
 
     scene: Scene
     guess: Guess
@@ -165,42 +171,52 @@ class _Matching(NamedTuple):
     control: Control
     unit: Array
 
+    @property
+    def size(self) -> int:
+        """Unknowns of a segment."""
+        return 9 if self.first.position is None else 12
+
     def unknown(self, z: Array) -> ShootingUnknown:
-        return ShootingUnknown(
-            jax.vmap(_turned)(self.first.rotation, z[:, :3]), self.first.reaction + z[:, 3:]
-        )
+        return jax.vmap(_changed)(self.first, z)
 
     def misfit(self, z: Array, ends: Array) -> Array:
-        """In rad, and in units of the reaction."""
+        """In rad, in units of the reaction, and in lengths of the arm."""
         off = _misfit(self.scene, self.unknown(z), ends, self.segments)
-        return off / jnp.concatenate([jnp.ones_like(self.unit[:3]), self.unit])
+        one = jnp.ones_like(self.unit[:3])
+        units = jnp.concatenate([one, self.unit, self.scene.rod.length * one])
+        return off / units[: self.size]
 
     def ends(self, z: Array) -> tuple[Array, Array, tuple]:
         """Reaction and rotation at the end of each segment, their derivatives by the segment's row
         of z, and of each segment the relative pose, whether diffrax succeeded, and its steps."""
 
-        def one(*row: Array) -> tuple[Array, tuple]:
-            end, found = self._end(*row)
+        def one(row: Array, first: ShootingUnknown, start: Array, h: Array) -> tuple[Array, tuple]:
+            end, found = self._end(row, first, start, h)
             return end, (end, found)
 
-        rows = z, self.first.rotation, self.first.reaction, self.segments.start, self.segments.h
+        rows = z, self.first, self.segments.start, self.segments.h
         slopes, (ends, found) = jax.vmap(jax.jacfwd(one, has_aux=True))(*rows)
         return ends, slopes, found
 
     def _end(
-        self, row: Array, R: Array, first: Array, start: Array, h: Array
+        self, row: Array, first: ShootingUnknown, start: Array, h: Array
     ) -> tuple[Array, tuple]:
-        rotation, reaction = _turned(R, row[:3]), first + row[3:]
+        begin = _changed(first, row)
         scene, guess, control, all_of_it = self.scene, self.guess, self.control, jnp.ones_like(h)
-        line, done, steps = integrate(
-            scene, guess, control, start, h, rotation, reaction, all_of_it, self.unit
-        )
-        end = (rotation @ line.g[:3, :3]).reshape(-1)
-        return jnp.concatenate([self.unit * line.wrench, end]), (line.g, done, steps)
+        line, done, steps = integrate(scene, guess, control, start, h, begin, all_of_it, self.unit)
+        end = [self.unit * line.wrench, (begin.rotation @ line.g[:3, :3]).reshape(-1)]
+        if begin.position is not None:
+            end.append(begin.position + begin.rotation @ line.g[:3, 3])
+        return jnp.concatenate(end), (line.g, done, steps)
 
 
-def _turned(R: Array, k: Array) -> Array:
-    return R @ stacked_rotation(k)
+def _changed(first: ShootingUnknown, row: Array) -> ShootingUnknown:
+    """The start of a segment, changed by its row of z."""
+    return ShootingUnknown(
+        first.rotation @ stacked_rotation(row[:3]),
+        first.reaction + row[3:9],
+        None if first.position is None else first.position + row[9:],
+    )
 
 
 def shoot(
@@ -230,7 +246,7 @@ def shoot(
         # the step after the first that fits is taken too: it squares the misfit
         return (at.taken < _SHOTS) & (at.before > tolerance)
 
-    zero = jnp.zeros((number, 9), segments.h.dtype)
+    zero = jnp.zeros((number, match.size), segments.h.dtype)
     none, far = jnp.zeros((), jnp.int32), jnp.asarray(jnp.inf, zero.dtype)
     poses = jnp.zeros((number, 4, 4), zero.dtype)
     begin = _Iterate(zero, zero, far, far, none, jnp.array(False), none, poses)
@@ -268,22 +284,32 @@ def wrench_scale(scene: Scene, reaction: Array) -> Array:
 
 def _misfit(scene: Scene, unknown: ShootingUnknown, ends: Array, segments: Grid) -> Array:
     """Mismatch of the segments: rotation (3) at the start against the end of the segment before,
-    reaction (6) at the end against the start of the next."""
-    base = base_pose(scene.rod.base, ends.dtype)[:3, :3]
-    wrench, rotation = ends[:, :6], ends[:, 6:].reshape(-1, 3, 3)
-    before = jnp.concatenate([base[None], rotation[:-1]])
+    reaction (6) at the end against the start of the next, and position (3) as the rotation."""
+    base = base_pose(scene.rod.base, ends.dtype)
+    wrench, rotation, position = ends[:, :6], ends[:, 6:15].reshape(-1, 3, 3), ends[:, 15:]
+    before = jnp.concatenate([base[None, :3, :3], rotation[:-1]])
     m = jnp.einsum("sji,sjk->sik", before, unknown.rotation)
     turn = unskew(m)
     carried = jnp.concatenate([unknown.reaction[1:], jnp.zeros_like(wrench[:1])])
-    for frame in ("world", "body"):
-        for X, point in scene.point_wrenches(frame):
-            # the segment that ends where the load acts
-            here = jnp.arange(segments.h.size) == jnp.sum(segments.start < X) - 1
-            load = jnp.stack(point)
-            if frame == "world":
-                load = jnp.concatenate(
-                    [jnp.einsum("sji,j->si", rotation, part) for part in (load[:3], load[3:])],
-                    axis=1,
-                )
-            carried = carried + jnp.where(here[:, None], load, 0.0)
-    return jnp.concatenate([turn, wrench - carried], axis=1)
+
+    def added(carried: Array, X: Array, load: Array) -> Array:
+        # to the segment that ends where the load acts
+        here = jnp.arange(segments.h.size) == jnp.sum(segments.start < X) - 1
+        return carried + jnp.where(here[:, None], load, 0.0)
+
+    back = jax.vmap(lambda R, load: turned(R.T, load))
+    for X, point in scene.point_wrenches("body"):
+        carried = added(carried, X, jnp.stack(point))
+    for X, point in scene.point_wrenches("world"):
+        load = jnp.broadcast_to(jnp.stack(point), wrench.shape)
+        carried = added(carried, X, back(rotation, load))
+    places = position if position.size else jnp.zeros((segments.h.size, 3), ends.dtype)
+    for load in scene.pose_loads:
+        X = load.place(scene.rod)
+        if X is not None:
+            world = jax.vmap(partial(load.wrench, scene.rod, X))(rotation, places)
+            carried = added(carried, X, back(rotation, world))
+    parts = [turn, wrench - carried]
+    if unknown.position is not None:
+        parts.append(unknown.position - jnp.concatenate([base[None, :3, 3], position[:-1]]))
+    return jnp.concatenate(parts, axis=1)

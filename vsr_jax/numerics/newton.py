@@ -41,6 +41,13 @@ _MAX_RISES = 3
 """Rises of an accepted residual after which it is taken to be at rounding level."""
 
 
+_PROBES, _SETTLING, _DECAYED, _PROBE_DAMPING = 16, 6, 0.1, 1.0
+"""Steps of a creeping arm by which a doubtful solution is probed; the first of them that only let
+the slowest motion prevail; the remainder after the others that ends them; and their damping: a
+motion of stiffness $\\lambda$, relative to the elastic one, is multiplied by $1 / (1 + \\lambda)$
+in each."""
+
+
 class Evaluation(NamedTuple):
     """Evaluation of one point for `newton`: the step to subtract, its size, the size of the
     residual, and whether the tangent is positive definite. The sizes are dimensionless, with one
@@ -113,13 +120,23 @@ def newton(evaluate: Callable[[Any], Evaluation], start: Any, floor: Array) -> I
 
 class Damped(NamedTuple):
     """Evaluation of one point and one damping for `damped_newton`: the step to subtract, its size,
-    the residual, its size, and whether the damped tangent is positive definite."""
+    the residual, its size, whether the damped tangent is positive definite, and whether that is
+    doubtful, since it is far from symmetric."""
 
     step: Any
     size: Array
     residual: Any
     merit: Array
     definite: Array
+    doubtful: Array
+
+
+class Measures(NamedTuple):
+    """Measures of steps for `damped_newton`, with one entry per problem: `work`, the scalar product
+    of a residual and a step, and `turn`, a norm of a step."""
+
+    work: Callable[[Any, Any], Array]
+    turn: Callable[[Any], Array]
 
 
 class _Guard(NamedTuple):
@@ -127,7 +144,8 @@ class _Guard(NamedTuple):
     of the sum of all steps to come, size of the residual, whether the tangent is definite, the work
     of the residual over the step; damping, load increments applied, whether the step may be tried,
     how often an undamped step raised an accepted residual, whether the loads come by increments,
-    and the number of evaluations and of plain Newton steps."""
+    the number of evaluations and of plain Newton steps; whether the solution is to be probed, the
+    number of probes, and the growth of the motion in them."""
 
     size: Array
     miss: Array
@@ -141,11 +159,14 @@ class _Guard(NamedTuple):
     gradual: Array
     spent: Array
     plain: Array
+    doubtful: Array
+    probes: Array
+    growth: Array
 
 
 def damped_newton(
     evaluate: Callable[[Any, Array, Array], Damped],
-    work: Callable[[Any, Any], Array],
+    measures: Measures,
     start: Any,
     floor: Array,
     increments: int = 1,
@@ -167,6 +188,9 @@ def damped_newton(
     - Extrapolation. The tangent may be approximate. Where it is much too stiff for a soft motion of
       the arm, the residual along a full step contracts only by $\rho$ near 1. The next step then
       includes $\rho^2 / (1 - \rho)$ of the last one, the remainder of the geometric series.
+    - Probing. Where the tangent is doubtful at the end, the arm is moved from the solution by the
+      last step, made small, and creeps: $s_{n+1} = s_n + (H + \mu \Sigma)^{-1} r(x - s_n)$. The
+      solution is unstable if the motion grows after some steps.
 
     The iteration ends where the residual is accepted, the step is undamped, and either the step
     times $1 / (1 - \rho)$, the sum of all steps to come, is negligible, or the residual has risen
@@ -178,7 +202,7 @@ def damped_newton(
 
     **Arguments:**
     - `evaluate`: maps a point, a damping $\mu$ and the fraction of the loads to `Damped`.
-    - `work`: scalar product of a residual and a step.
+    - `measures`: of steps.
     - `floor`: size of the residual that counts as rounding, one entry per problem.
     - `increments`: number of load increments.
     - `origin`: where the second attempt begins, the start by default.
@@ -191,31 +215,42 @@ def damped_newton(
     small = jnp.finfo(floor.dtype).eps ** 0.75
     accepted = jnp.maximum(_ACCEPTED * floor, small)
 
-    def pending(guard: _Guard) -> Array:
+    def going(guard: _Guard) -> Array:
         negligible = (guard.miss < small) | (guard.rises >= _MAX_RISES)
         done = guard.fresh & (guard.damping == 0) & (guard.merit <= accepted) & negligible
         stuck = ~guard.definite & (guard.merit < floor)
         return ~((done | stuck) & (guard.applied == increments)) & (guard.plain < MAX_PLAIN_STEPS)
 
+    def probing(guard: _Guard) -> Array:
+        found = ~going(guard) & guard.definite & (guard.merit <= accepted)
+        decayed = guard.growth < _DECAYED
+        return found & guard.doubtful & (guard.probes < _PROBES) & ~decayed
+
     def advance(state: tuple) -> tuple:
         x, step, old = state
+        probe = probing(old)
+        step = _shrunk(step, probe, measures.turn)
         plain = (old.spent >= MAX_DAMPED_STEPS) | (old.damping >= _MAX_DAMPING) | (old.plain > 0)
         trial = jax.tree.map(lambda a, s: jnp.where(old.fresh, a - s.astype(a.dtype), a), x, step)
         damping, applied = _attempt(old, plain, increments)
-        new = evaluate(trial, damping, applied / increments)
-        left = work(new.residual, step)
+        new = evaluate(trial, jnp.where(probe, _PROBE_DAMPING, damping), applied / increments)
+        left = measures.work(new.residual, step)
         taken = _accepted(old, new, left, floor, plain, increments)
         guard, more = _judged(old, new, left, taken, plain, damping, applied, floor, accepted)
+        more = jnp.where(probe, 1.0, more)
         new_step = jax.tree.map(lambda s, last: s + more.astype(s.dtype) * last, new.step, step)
-        guard = guard._replace(pull=jnp.where(taken, work(new.residual, new_step), guard.pull))
-        go = pending(old)
+        pull = jnp.where(taken, measures.work(new.residual, new_step), guard.pull)
+        go = going(old)
+        ratio = jnp.where(probe, measures.turn(new_step) / measures.turn(step), 0.0)
+        guard = select(go, guard._replace(pull=pull), _probed(old, probe, ratio))
         x = select(go & taken, trial, x)
         if not twice:
-            return x, new_step, select(go, guard, old)
-        again = go & ~old.gradual & ~(taken & new.definite)
+            return x, new_step, guard
+        failed = jnp.where(go, ~(taken & new.definite), old.definite & ~guard.definite)
+        again = ~old.gradual & failed
         guard = select(again, careful._replace(gradual=~careful.gradual, spent=guard.spent), guard)
         new_step = jax.tree.map(lambda s: jnp.where(again, 0.0, s).astype(s.dtype), new_step)
-        return select(again, origin, x), new_step, select(go, guard, old)
+        return select(again, origin, x), new_step, guard
 
     careful = first = _careful(floor, increments)
     if twice:
@@ -226,7 +261,7 @@ def damped_newton(
         jax.eval_shape(evaluate, start, floor, floor).step,
     )
     x, _, guard = lax.while_loop(
-        lambda state: jnp.any(pending(state[2])), advance, (start, step, first)
+        lambda state: jnp.any(going(state[2]) | probing(state[2])), advance, (start, step, first)
     )
     return Root(x, guard.merit <= accepted, guard.definite, guard.spent)
 
@@ -237,8 +272,39 @@ def _careful(floor: Array, increments: int) -> _Guard:
     none = jnp.zeros(floor.shape, jnp.int32)
     damping = jnp.full_like(floor, 0.0 if increments > 1 else _MIN_DAMPING)
     return _Guard(
-        zero, zero, zero + jnp.inf, ~no, zero, damping, zero + 1, no, none, no, none, none
+        zero,
+        zero,
+        zero + jnp.inf,
+        ~no,
+        zero,
+        damping,
+        zero + 1,
+        no,
+        none,
+        no,
+        none,
+        none,
+        no,
+        none,
+        zero + 1,
     )
+
+
+def _shrunk(step: Any, probe: Array, turn: Callable[[Any], Array]) -> Any:
+    """The steps, those of a probe made so small that the residual is linear and so large that its
+    rounding is small."""
+    size = turn(step)
+    scale = jnp.finfo(size.dtype).eps ** 0.25 / jnp.where(size > 0, size, 1.0)
+    scale = jnp.where(probe, scale, 1.0)
+    return jax.tree.map(lambda s: scale.astype(s.dtype) * s, step)
+
+
+def _probed(old: _Guard, probe: Array, ratio: Array) -> _Guard:
+    """State after a probe, if it was one, along which the motion changed by the factor `ratio`."""
+    probes, spent = (count + probe.astype(jnp.int32) for count in (old.probes, old.spent))
+    growth = jnp.where(probe & (probes > _SETTLING), old.growth * ratio, old.growth)
+    grown = (probes == _PROBES) & (growth > 1)
+    return old._replace(definite=old.definite & ~grown, spent=spent, probes=probes, growth=growth)
 
 
 def _attempt(old: _Guard, plain: Array, increments: int) -> tuple[Array, Array]:
@@ -297,6 +363,7 @@ def _judged(
         applied=applied,
         fresh=new.definite | plain,
         rises=old.rises + risen.astype(jnp.int32),
+        doubtful=new.doubtful,
     )
     here = old._replace(damping=damping, fresh=plain)
     guard = select(taken, there, here)

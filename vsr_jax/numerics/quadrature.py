@@ -128,6 +128,17 @@ def beyond(density: Array, grid: Grid) -> Array:
     return jnp.moveaxis(sums[:-1], 0, 1) + jnp.moveaxis(later, 0, 1)[:, None]
 
 
+def sum_along(density: Array, grid: Grid) -> Array:
+    """Integral over the whole arm, of the same number of axes as `density`: components at the
+    nodes, shape (components, stages, steps, *arms)."""
+    return jnp.sum(grid.weight * density, axis=(1, 2), keepdims=True)
+
+
+def before(density: Array, grid: Grid) -> Array:
+    r"""Integral from the base to each node, $\int_0^X q \, ds$; see `beyond`."""
+    return sum_along(density, grid) - beyond(density, grid)
+
+
 def locate(grid: Grid, X: Array) -> tuple[Array, Array]:
     """Step in which each abscissa lies, and its place in the step as a fraction."""
     step = jnp.clip(jnp.searchsorted(grid.start, X, side="right") - 1, 0, grid.start.size - 1)

@@ -2,17 +2,24 @@ r"""The potential energy of an arm, part by part:
 
 $$\Pi = \int_0^L \tfrac12 (\xi - \xi^*)^T \Sigma (\xi - \xi^*) \, dX
 + \sum_{i \in \text{cables}} \frac{T_i^2}{2 k_i} (l_i^* + \delta_i)
-- \sum_{i \in \text{forces}} \tau_i l_i - \int_0^L f \cdot r \, dX - \sum_j F_j \cdot r(X_j).$$
+- \sum_{i \in \text{forces}} \tau_i l_i - \int_0^L f \cdot r \, dX - \sum_j F_j \cdot r(X_j)
++ V,$$
+
+with V the potential of the loads that depend on the pose of their section.
 
 An equilibrium is a stationary point of it, under the lengths of the tendons that are driven by
 their length. So its derivative by a given force is $d\Pi / d\tau_i = -l_i$.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ..arm.pose_loads import PoseLoad
+from ..arm.rod import Rod
 from ..arm.scene import Scene
 from ..mechanics.balance import thread_direction
 from ..mechanics.cable import cable_of
@@ -27,7 +34,7 @@ class Energy(NamedTuple):
 
     **Fields:** `elastic`: of the rod's strain; `cables`: of the stretch of tendons that are driven
     by their length; `actuation`: of given forces and pressures; `loads`: of dead forces, zero for
-    an axis at the world's origin.
+    an axis at the world's origin, and of loads that depend on the pose.
     """
 
     elastic: Scalar
@@ -42,29 +49,52 @@ class Energy(NamedTuple):
 
 
 def energy_of(
-    scene: Scene, inputs: Array, forces: Vector, nodes: Nodes, positions: Array, at_points: Array
+    scene: Scene, inputs: Array, forces: Vector, nodes: Nodes, poses: Callable[[Array], Array]
 ) -> Energy:
     """Energy of a solved scene.
 
-    **Arguments:** `forces` [N] of the threads at their start; `positions` [m] of the nodes, shape
-    (*nodes, 3); `at_points` [m], those of the scene's dead point loads, shape (points, 3).
+    **Arguments:** `forces` [N] of the threads at their start; `poses`: function of abscissas that
+    returns the poses there.
     """
     weight, driven = nodes.grid.weight, scene.length_driven
     strain = c.subtract(nodes.xi, nodes.sections.rest)
     elastic = jnp.sum(weight * c.dot(c.multiply(nodes.sections.stiffness, strain), strain)) / 2
     tau, zero = nodes.tau(forces), jnp.zeros_like(elastic)
-    actuation = cables = loads = zero
+    actuation = cables = zero
     for i, path in enumerate(nodes.sections.paths):
         if i in driven:
             cables = cables + _stretch(scene, inputs, forces, nodes, i)
         else:
             actuation -= jnp.sum(weight * tau[i] * thread_direction(nodes.xi, path)[1])
-    density = scene.density(nodes.grid.X, "world")
+    return Energy(elastic, cables, actuation, _of_loads(scene, nodes, poses))
+
+
+def _of_loads(scene: Scene, nodes: Nodes, poses: Callable[[Array], Array]) -> Scalar:
+    """Potential of the dead forces and of the loads that depend on the pose."""
+    rod, dead, grid = scene.rod, scene.point_wrenches("world"), nodes.grid
+    held = [(load, load.place(rod)) for load in scene.pose_loads]
+    points = [*(x for x, _ in dead), *(x for _, x in held if x is not None)]
+    nodal = grid.X.reshape(-1)
+    g = poses(jnp.concatenate([nodal, jnp.array(points, nodal.dtype)]))
+    along, at_points = g[: nodal.size], list(g[nodal.size :])
+    weight, total = grid.weight.reshape(-1), jnp.zeros_like(rod.length)
+    density = scene.density(nodal, "world")
     if density is not None:
-        loads -= jnp.sum(weight * c.dot(density[3:], c.split(positions)))
-    for place, (_, wrench) in zip(at_points, scene.point_wrenches("world"), strict=True):
-        loads -= c.dot(wrench[3:], c.split(place))
-    return Energy(elastic, cables, actuation, loads)
+        total -= jnp.sum(weight * c.dot(density[3:], c.split(along[:, :3, 3])))
+    for _, wrench in dead:
+        total -= c.dot(wrench[3:], c.split(at_points.pop(0)[:3, 3]))
+    for load, X in held:
+        if X is None:
+            of_node = jax.vmap(lambda x, g, load=load: _potential(load, rod, x, g))
+            total += jnp.sum(weight * of_node(nodal, along))
+        else:
+            total += _potential(load, rod, X, at_points.pop(0))
+    return total
+
+
+def _potential(load: PoseLoad, rod: Rod, X: Array, g: Array) -> Scalar:
+    energy = load.potential(rod, X, g[:3, :3], g[:3, 3])
+    return jnp.zeros_like(X) if energy is None else energy
 
 
 def _stretch(scene: Scene, inputs: Array, forces: Vector, nodes: Nodes, place: int) -> Array:

@@ -159,12 +159,7 @@ class Equilibrium(Solved):
         With friction no potential exists, and the part of the actuation is
         $-\int \tau |t_c| dX$.
         """
-        nodes, points = self.nodes, [x for x, _ in self.scene.point_wrenches("world")]
-        X = jnp.concatenate([nodes.grid.X.reshape(-1), jnp.array(points, self.inputs.dtype)])
-        places = self.position(X)
-        inner = places[: nodes.grid.X.size].reshape(*nodes.grid.X.shape, 3)
-        end = places[nodes.grid.X.size :]
-        return energy_of(self.scene, self.inputs, self.sound_forces, nodes, inner, end)
+        return energy_of(self.scene, self.inputs, self.sound_forces, self.nodes, self.pose)
 
     @quantity("m", "actuator")
     def lengths(self) -> Float[Array, " threads"]:

@@ -7,10 +7,10 @@ $(m, n)$ and the derivative $p'$ of the axis, all in the world frame, the residu
 
 $$\delta r = H \, \delta\xi - (R^T (\delta m - \theta \times m),
 R^T (\delta n - \theta \times n)), \quad
--\delta n' = \theta \times f, \quad -\delta m' = (\theta \times p' + R \upsilon) \times n + p'
-\times \delta n + \theta \times c,$$
+-\delta n' = \delta f, \quad -\delta m' = \rho' \times n + p' \times \delta n + \delta c,$$
 
-where c and f are the densities of the follower loads. A product with the tangent thus takes a few
+with the displacement $\rho' = \theta \times p' + R \upsilon$ and the changes of the load densities
+by rotation and displacement. A product with the tangent thus takes a few
 sums along the arm. It is the exact derivative of the discrete residual: $\theta$ is that of the
 Magnus steps.
 """
@@ -34,7 +34,7 @@ from ..mechanics.balance import (
     thread_direction,
     thread_wrench,
 )
-from ..mechanics.reaction import Loading, Reaction, loading, partial_rotation, react
+from ..mechanics.reaction import Loading, Reaction, loading, partial_rotation, react, slopes_of
 from ..models.base import Nodes
 from ..numerics import component as c, stacked
 from ..numerics.component import Matrix, Vector
@@ -115,23 +115,24 @@ def _extreme_jvp(place: int, primals: tuple[Arm], tangents: tuple[Arm]) -> tuple
     return values[place], change_of(lambda arm: arm.form(vectors[place]), primals, tangents)
 
 
-class _Following(NamedTuple):
-    """A follower point wrench in the world frame.
+class _PointSlope(NamedTuple):
+    """Derivative (6, motion) of a wrench at a point in the world frame with respect to the motion
+    of its section (see `mechanics.reaction`).
 
     **Fields:** `end`: 1 at its place among the starts of the steps and the tip; `before`: 1 at the
-    nodes between the base and that place; `wrench`: (M, F).
+    nodes between the base and that place; `matrix`.
     """
 
     end: Float[Array, " steps_and_one"]
     before: Float[Array, "stages steps"]
-    wrench: Float[Array, "6"]
+    matrix: Float[Array, "6 motion"]
 
 
 class _Along(NamedTuple):
     r"""Linearisation of the reaction with respect to the strain, in the world frame.
 
-    **Fields:** `rotation` R, `wrench` (m, n) and `axis` p' at the nodes; `follower`: density
-    (c, f) of the follower loads; `points`: follower point wrenches; `turn`: derivative of the
+    **Fields:** `rotation` R, `wrench` (m, n), `axis` p' and `weight` at the nodes; `density`:
+    derivative of the load density by the motion of its section; `points`; `turn`: derivative of the
     rotation from the start of each step to its nodes, and in the last row of the whole step, with
     respect to the angular strains (component and stage) at the nodes of the step; `beyond`: matrix
     that takes values at the nodes to their integrals from each node to the tip.
@@ -140,8 +141,9 @@ class _Along(NamedTuple):
     rotation: Float[Array, "3 3 stages steps"]
     wrench: Float[Array, "6 stages steps"]
     axis: Float[Array, "3 stages steps"]
-    follower: Float[Array, "6 stages steps"] | None
-    points: tuple[_Following, ...]
+    weight: Float[Array, "stages steps"]
+    density: Float[Array, "6 motion stages steps"] | None
+    points: tuple[_PointSlope, ...]
     turn: Float[Array, "strains 3 rows steps"]
     beyond: Float[Array, "nodes nodes"]
 
@@ -222,15 +224,17 @@ def _along(xi: Vector, grid: Grid, loads: Loading) -> _Along:
     now = react(xi, grid, loads)
     unit = jnp.eye(size, dtype=grid.h.dtype).reshape(1, *grid.X.shape, size)
     (integral,) = beyond(unit, grid._replace(h=grid.h[:, None]))
+    slopes = slopes_of(now, loads)
     points = tuple(
-        _Following((jnp.arange(steps + 1) == point.step).astype(grid.h.dtype), point.before, wrench)
-        for point, wrench in zip(loads.follower_points, now.points, strict=True)
+        _PointSlope((jnp.arange(steps + 1) == p.step).astype(grid.h.dtype), p.before, p.matrix)
+        for p in slopes.points
     )
     return _Along(
         now.rotation,
         now.world,
         now.axis,
-        now.follower,
+        grid.weight,
+        slopes.density,
         points,
         _turns(stacked.stack(xi[:3]), grid, now),
         integral.reshape(size, size),
@@ -280,15 +284,21 @@ def _reaction_change(x: Array, along: _Along) -> Array:
 
     (m, n), p = (along.wrench[:3], along.wrench[3:]), along.axis
     dm, dn = cross(m, theta), cross(n, theta)
+    moving = cross(theta, p) + stacked.matvec(along.rotation, x[3:])
+    moved = jnp.zeros_like(along.wrench)  # the change of the loads beyond, without levers
     for point in along.points:
         turn = jnp.sum(point.end * starts, axis=1)
-        moment, force = (cross(turn, part)[:, None, None] for part in jnp.split(point.wrench, 2))
-        dm, dn = dm + point.before * moment, dn + point.before * force
-    density = cross(cross(theta, p) + stacked.matvec(along.rotation, x[3:]), n)
-    if along.follower is not None:
-        dn = dn + integral(cross(theta, along.follower[3:]))
-        density = density + cross(theta, along.follower[:3])
-    if along.follower is not None or along.points:
-        density = density + cross(p, dn - cross(n, theta))
-    moved = jnp.concatenate([dm + integral(density), dn])
-    return stacked.turned(stacked.transpose(along.rotation), moved)
+        shift = jnp.sum(along.weight * point.before * moving, axis=(1, 2))
+        motion = jnp.concatenate([turn, shift])[: point.matrix.shape[1]]
+        moved = moved + point.before * (point.matrix @ motion)[:, None, None]
+    if along.density is not None:
+        motion = theta
+        if along.density.shape[1] == 6:
+            whole = jnp.sum(along.weight * moving, axis=(1, 2), keepdims=True)
+            motion = jnp.concatenate([theta, whole - integral(moving)])
+        moved = moved + integral(stacked.matvec(along.density, motion))
+    density = cross(moving, n)
+    if along.density is not None or along.points:
+        density = density + cross(p, moved[3:])
+    change = moved + jnp.concatenate([dm + integral(density), dn])
+    return stacked.turned(stacked.transpose(along.rotation), change)

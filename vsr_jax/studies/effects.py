@@ -12,6 +12,7 @@ from jaxtyping import Array, PyTree
 from ..arm.actuator import Tendon
 from ..arm.loads import Gravity, PointWrench, TipWrench
 from ..arm.material import Material
+from ..arm.pose_loads import Payload, Spring
 from ..arm.profile import Piecewise
 from ..arm.rod import Rod
 from ..arm.routing import Helix, Parallel
@@ -52,7 +53,7 @@ class Cost(NamedTuple):
 
 def scenes() -> list[EffectScene]:
     """Tendons only, + poses, + gravity, + tip wrench, + follower, + second section, + length
-    control, + friction."""
+    control, + friction, + payload, + spring."""
     soft, hard = 4.0e5, 8.0e5
     arm = Rod(0.3, Circular(0.01), Material(hard, poisson=0.45, density=1000.0))
     jointed = Rod(
@@ -71,6 +72,8 @@ def scenes() -> list[EffectScene]:
         Tendon(helix, friction=0.1),
         Tendon(straight, end=0.15, control="length"),
     ]
+    carrying = [*loads, Payload(0.005, offset=(0.0, 0.0, -0.02))]
+    tied = [*carrying, Spring((0.3, 0.0, -0.1), 0.5)]
     return [
         EffectScene("tendons only", Scene(arm, tendons), pose=False),
         EffectScene("+ poses", Scene(arm, tendons)),
@@ -80,6 +83,8 @@ def scenes() -> list[EffectScene]:
         EffectScene("+ second section", Scene(jointed, ended, loads)),
         EffectScene("+ length control", Scene(jointed, driven, loads), SHORTENED),
         EffectScene("+ friction", Scene(jointed, tendons_with_friction, loads), SHORTENED),
+        EffectScene("+ payload", Scene(jointed, tendons_with_friction, carrying), SHORTENED),
+        EffectScene("+ spring", Scene(jointed, tendons_with_friction, tied), SHORTENED),
     ]
 
 

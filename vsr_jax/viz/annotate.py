@@ -1,6 +1,7 @@
 """Annotations of an arm in 3D, drawn after `plot.arm`: frames of sections, arrows of loads,
 ellipsoids of the tip."""
 
+import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
@@ -10,6 +11,7 @@ from mpl_toolkits.mplot3d import Axes3D
 
 from ..analysis.derivatives import Ellipsoid
 from ..arm.loads import Frame
+from ..arm.pose_loads import PoseLoad
 from ..solution.equilibrium import Equilibrium
 from .plot import COLORS, equal_scale
 
@@ -83,6 +85,10 @@ def _point_forces(eq: Equilibrium) -> list[tuple[np.ndarray, np.ndarray]]:
         if points:
             force = jnp.stack([jnp.stack(wrench[3:]) for _, wrench in points])
             found.append(_placed(eq, jnp.stack([x for x, _ in points]), force, frame))
+    for load in eq.scene.pose_loads:
+        X = load.place(eq.scene.rod)
+        if X is not None:
+            found.append(_posed(eq, load, X[None]))
     return found
 
 
@@ -94,7 +100,15 @@ def _densities(eq: Equilibrium, length: float) -> list[tuple[np.ndarray, np.ndar
         density = eq.scene.density(X, frame)
         if density is not None:
             found.append(_placed(eq, X, jnp.stack(density[3:], axis=-1), frame))
-    return found
+    along = [load for load in eq.scene.pose_loads if load.place(eq.scene.rod) is None]
+    return found + [_posed(eq, load, X) for load in along]
+
+
+def _posed(eq: Equilibrium, load: PoseLoad, X: Array) -> tuple[np.ndarray, np.ndarray]:
+    """Positions at abscissas X, and the force there of a load that depends on the pose."""
+    poses = eq.pose(X)
+    wrench = jax.vmap(lambda x, g: load.wrench(eq.scene.rod, x, g[:3, :3], g[:3, 3]))(X, poses)
+    return np.asarray(poses[:, :3, 3]), np.asarray(wrench[:, 3:])
 
 
 def _placed(eq: Equilibrium, X: Array, force: Array, frame: Frame) -> tuple[np.ndarray, np.ndarray]:

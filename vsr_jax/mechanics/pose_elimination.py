@@ -1,0 +1,190 @@
+r"""The tangent of the balance under loads that depend on positions, solved by block elimination.
+
+As in `elimination`, each node represents a cell of its weight w, integrated by the midpoint rule.
+In the frame of its section the motion of a section is $z = (\theta, \rho)$, rotation and
+displacement, and the change of the wrench at its end an affine function of it, $P z + p$: the
+stiffness of the arm beyond, springs included, so that a stiff spring is eliminated exactly. With
+$K = (C; F)$ the derivative of the load density (c, f) by the motion,
+
+$$\theta' = \kappa, \quad \rho' = \theta \times u + \upsilon, \quad
+-\delta m' = \rho' \times n + u \times \delta n + C z, \quad -\delta n' = F z,$$
+
+and $H \, \delta\xi = (\delta m - \theta \times m, \delta n - \theta \times n) + b$ in the middle of
+the cell is a 6 x 6 system for the strain $\delta\xi = (\kappa, \upsilon)$, solved by blocks.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from ..numerics import component as c
+from ..numerics.component import Matrix, Vector
+from ..numerics.quadrature import Grid
+from ..numerics.stacked import columns, matmul, matvec, once, rows, skew, transpose
+from .elimination_nodes import (
+    Definiteness,
+    Node,
+    asymmetry_of,
+    definiteness,
+    inverse_block,
+    node_components,
+    nodes_of,
+    turns,
+)
+from .reaction import Reaction, Slopes
+
+
+class PoseCell(NamedTuple):
+    r"""Coefficients of one cell that do not depend on P.
+
+    - `width` w; `turn`: rotation of the next node's section in this frame.
+    - `lever` $-\frac w2 \tilde u$: the motion in the middle of the cell is $Z (z + \frac w2
+      \delta\xi)$ with $Z = (1, 0; \text{lever}, 1)$.
+    - `stiff`: the 6 x 6 system without P; `drive`, `right`: its right side per motion, and b.
+    - Over the cell the wrench changes by `by_motion` z + `by_strain` $\delta\xi$, without the part
+      through P.
+    - `jump`: derivative of the load at the end of the cell by its motion, None without such loads.
+    """
+
+    width: Array
+    turn: Array
+    lever: Array
+    stiff: Array
+    drive: Array
+    right: Array
+    by_motion: Array
+    by_strain: Array
+    jump: Array | None
+
+
+def eliminate_poses(
+    lower: Matrix,
+    right: Vector,
+    xi: Vector,
+    along: Reaction,
+    slopes: Slopes,
+    grid: Grid,
+    free: tuple[int, ...],
+) -> tuple[Vector, Definiteness]:
+    """As `eliminate`, for motions of size 6."""
+    nodes = nodes_of(c.symmetric(lower), right, xi, along, slopes, grid)
+    cells = jax.vmap(_cell_of)(nodes, turns(nodes.rotation))
+    arms = nodes.weight.shape[1:]
+    nothing = jnp.zeros((6, 7, *arms), cells.width.dtype)
+    _, (X, negative, asymmetry) = lax.scan(partial(_cell, free), nothing, cells, reverse=True)
+
+    def forward(z: Array, cell: tuple) -> tuple[Array, Array]:
+        X, turn, lever, width = jax.tree.map(once, cell)
+        strain = matvec(columns(X, 0, 6), z) + X[:, 6]
+        middle = z + 0.5 * width * strain
+        sheared = rows(middle, 3, 6) + matvec(lever, rows(middle, 0, 3))
+        end = 2.0 * jnp.concatenate([rows(middle, 0, 3), sheared]) - z
+        back = transpose(turn)
+        parts = [matvec(back, rows(end, i, i + 3)) for i in (0, 3)]
+        return jnp.concatenate(parts), strain
+
+    start = jnp.zeros((6, *arms), X.dtype)
+    _, strain = lax.scan(forward, start, (X, cells.turn, cells.lever, cells.width))
+    local = jnp.ones(negative.shape, bool)
+    return node_components(strain, grid), definiteness(negative, local, asymmetry, grid)
+
+
+def _cell_of(node: Node, turn: Array) -> PoseCell:
+    """All that does not depend on P, for one node."""
+    w = node.weight
+    u, m, n = skew(node.axis), skew(rows(node.wrench, 0, 3)), skew(rows(node.wrench, 3, 6))
+    none, lever = jnp.zeros_like(n), -0.5 * w * u
+    H = _blocks(node.bending, node.mixed, transpose(node.mixed), node.linear)
+    by_middle = _blocks(matmul(n, u), none, none, none)
+    if node.density is not None:
+        by_middle = by_middle + _from_left(lever, seen_from(node.rotation, node.density))
+    by_motion = _from_right(w * by_middle, lever)
+    by_strain = w * _blocks(none, -n, none, none)
+    drive = 0.5 * by_motion + _blocks(m, none, n, none)
+    return PoseCell(
+        w,
+        turn,
+        lever,
+        H - 0.5 * (w * drive + by_strain),
+        drive,
+        node.right,
+        by_motion,
+        0.5 * w * by_motion + by_strain,
+        None if node.jump is None else seen_from(node.rotation, node.jump),
+    )
+
+
+def _cell(free: tuple[int, ...], end: Array, cell: PoseCell) -> tuple[Array, tuple]:
+    """One cell, from its end to its start: the affine change of the wrench at the start (6, 7), the
+    affine strain by the motion at the start (6, 7), the number of negative pivots and the asymmetry
+    of the cell."""
+    cell = jax.tree.map(once, cell)
+    w, lever = cell.width, cell.lever
+    P = _turned(cell.turn, end)
+    if cell.jump is not None:
+        P = P + jnp.concatenate([cell.jump, jnp.zeros_like(columns(P, 6, 7))], axis=1)
+    middle = _from_left(lever, P)  # of the wrench in the middle of the cell
+    square = once(_from_right(columns(middle, 0, 6), lever))
+    by_start = 2.0 * square - columns(middle, 0, 6) + cell.drive
+    constant = columns(middle, 6, 7) + cell.right[:, None]
+    X, negative, compliance = _solved(
+        cell.stiff - w * square, jnp.concatenate([by_start, constant], axis=1), free
+    )
+    start = 2.0 * middle - P  # of the wrench at the start of the cell, without its own loads
+    square = once(_from_right(columns(start, 0, 6), lever))
+    by_start = 2.0 * square - columns(start, 0, 6) + cell.by_motion
+    start = jnp.concatenate([by_start, columns(start, 6, 7)], axis=1)
+    asymmetry = asymmetry_of(columns(P[:3], 0, 3), compliance)
+    return start + matmul(w * square + cell.by_strain, X), (X, negative, asymmetry)
+
+
+def _solved(D: Array, right: Array, free: tuple[int, ...]) -> tuple[Array, Array, Array]:
+    """Solution of a 6 x 6 system for the free strains, zero for the others, the number of negative
+    eigenvalues of the matrix, and the inverse of its bending block."""
+    b, below, d = D[:3, 3:], D[3:, :3], D[3:, 3:]
+    flexibility, first = inverse_block(d, tuple(i - 3 for i in free if i > 2))
+    across = matmul(b, flexibility)
+    compliance, second = inverse_block(
+        D[:3, :3] - matmul(across, below), tuple(i for i in free if i < 3)
+    )
+    bent = matmul(compliance, right[:3] - matmul(across, right[3:]))
+    stretched = matmul(flexibility, right[3:] - matmul(below, bent))
+    return jnp.concatenate([bent, stretched]), first + second, compliance
+
+
+def _blocks(a: Array, b: Array, below: Array, d: Array) -> Array:
+    """Matrix (6, 6, ...) of four blocks."""
+    top, bottom = jnp.concatenate([a, b], axis=1), jnp.concatenate([below, d], axis=1)
+    return jnp.concatenate([top, bottom])
+
+
+def _from_left(lever: Array, a: Array) -> Array:
+    r"""$Z^T A$ of a matrix with six rows."""
+    upper = rows(a, 0, 3) + matmul(transpose(lever), rows(a, 3, 6))
+    return jnp.concatenate([upper, rows(a, 3, 6)])
+
+
+def _from_right(a: Array, lever: Array) -> Array:
+    r"""$A Z$ of a matrix with six columns."""
+    left = columns(a, 0, 3) + matmul(columns(a, 3, 6), lever)
+    return jnp.concatenate([left, columns(a, 3, 6)], axis=1)
+
+
+def _turned(turn: Array, P: Array) -> Array:
+    """An affine function (6, 7) of the motion of a section, in a frame from which the section's
+    frame is seen with a rotation."""
+    seen = jnp.concatenate([matmul(turn, rows(P, i, i + 3)) for i in (0, 3)])
+    back = transpose(turn)
+    parts = [matmul(columns(seen, i, i + 3), back) for i in (0, 3)]
+    return jnp.concatenate([*parts, columns(seen, 6, 7)], axis=1)
+
+
+def seen_from(R: Array, slope: Array) -> Array:
+    """A derivative (6, 6, ...) of a wrench by a motion, in the frame of a section."""
+    back = transpose(R)
+    none = jnp.zeros_like(columns(slope, 0, 1))
+    return columns(_turned(back, jnp.concatenate([slope, none], axis=1)), 0, 6)
