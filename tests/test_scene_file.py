@@ -84,6 +84,11 @@ def full_scene() -> vsr.Scene:
         vsr.TipWrench(moment=(0.0, 1e-3, 0.0), frame="body"),
         vsr.PointWrench(0.2, force=(0.1, 0.2, 0.3)),
         vsr.DistributedWrench((0.1, vsr.Taper(0.1, 0.2), -0.3)),
+        vsr.Spring((0.1, 1 / 3, 0.0), 2.0, 0.2, length=0.1, kind="cord"),
+        vsr.Payload(0.1, offset=(0.0, 0.01, -1 / 70), volume=1e-5, fluid_density=1000.0),
+        vsr.MagneticMoment((0.0, 0.1, 0.2), (0.0, 0.0, 0.1)),
+        vsr.MagneticDensity((vsr.Taper(0.1, 0.2), 0.0, 0.1), (0.0, 1 / 3, 0.0)),
+        vsr.Spinning((0.0, 0.0, 2 / 3)),
     ]
     return vsr.Scene(rod, actuators, loads, free_strains=("bending_y", "bending_z", "elongation"))
 

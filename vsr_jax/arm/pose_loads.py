@@ -240,9 +240,9 @@ class _Magnetic(PoseLoad):
 
 
 def _field(name: str, field: Field) -> Array | Callable:
-    if isinstance(field, eqx.Module):
-        return field
-    return _FieldOf(field) if callable(field) else numbers(name, field, (3,))
+    if not callable(field):
+        return numbers(name, field, (3,))
+    return field if isinstance(field, eqx.Module) else _FieldOf(field)
 
 
 class _FieldOf(eqx.Module):

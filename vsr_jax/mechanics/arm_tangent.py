@@ -54,12 +54,13 @@ def approximate_solve(
         (*row[:-1], row[-1] + damping * s) for row, s in zip(lower, sections.stiffness, strict=True)
     )
 
-    loaded = at.along is not None and problem.loads is not None
-    slopes = slopes_of(at.along, problem.loads) if loaded else None
+    along, loads = at.along, problem.loads
+    slopes = None if along is None or loads is None else slopes_of(along, loads)
 
     def solve(b: Vector) -> tuple[Vector, Definiteness]:
-        run = eliminate_poses if slopes is not None and slopes.motion == 6 else eliminate
-        return run(lower, b, unknown.xi, at.along, slopes, grid, kind.free)
+        if along is not None and slopes is not None and slopes.motion == 6:
+            return eliminate_poses(lower, b, unknown.xi, along, slopes, grid, kind.free)
+        return eliminate(lower, b, unknown.xi, along, slopes, grid, kind.free)
 
     strain, (negative, doubtful) = solve(spread(right.wrench, kind.free))
     if not kind.cables:

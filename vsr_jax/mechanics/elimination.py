@@ -30,7 +30,7 @@ from ..numerics import component as c, stacked
 from ..numerics.component import Matrix, Vector
 from ..numerics.quadrature import Grid
 from ..numerics.stacked import affine, columns, matmul, matvec, once, rows, skew, transpose
-from .balance import free_block, spread
+from .balance import free_block, free_components, spread
 from .elimination_nodes import (
     UNSTABLE_SECTION,
     Definiteness,
