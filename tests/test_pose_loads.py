@@ -1,6 +1,7 @@
 """Loads that depend on the pose of their section: closed forms, independent integration, the three
 models, derivatives, and what is refused."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -92,6 +93,28 @@ def test_known_wrenches():
     load = vsr.Spring(anchor, 5.0, length=0.1, offset=offset)
     spring = wrench_of(load, L, posed(turn, place))
     np.testing.assert_allclose(spring, [*np.cross(turn @ offset, pull), *pull], atol=1e-14)
+
+
+class Coil(eqx.Module):
+    """A field along z that grows with x [T]."""
+
+    slope: jax.Array
+
+    def __call__(self, r):
+        return jnp.stack([0.0 * r[0], 0.0 * r[0], self.slope * r[0]])
+
+
+def test_the_numbers_of_a_field_are_differentiable():
+    def tip(slope):
+        load = vsr.MagneticMoment((0.05, 0.0, 0.0), Coil(slope))
+        return vsr.solve(vsr.Scene(ROD, (), load), [], model=STEPS).tip[2, 3]
+
+    moment = 0.05 * 1e-6 * L  # bends the arm; to first order there is no force
+    assert float(tip(jnp.asarray(1e-6))) == pytest.approx(moment * L**2 / (2 * EI), rel=1e-3)
+    slope = jax.grad(tip)(jnp.asarray(0.1))
+    h = 1e-4
+    difference = (tip(jnp.asarray(0.1 + h)) - tip(jnp.asarray(0.1 - h))) / (2 * h)
+    assert float(slope) == pytest.approx(float(difference), rel=1e-6)
 
 
 def test_a_spring_of_no_length_has_a_slope_where_its_ends_meet():

@@ -12,7 +12,7 @@ Both, and their derivatives in the tangent of the arm, come from automatic diffe
 """
 
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -23,7 +23,13 @@ from ..numerics.stacked import cross, dot, matmul, matvec, skew
 from ..typing import ArrayLike, Scalar, Twist, VectorLike
 from ..validation import choice, numbers
 from .loads import THREE_PROFILES, Frame, Load, mass_per_length, need_density
-from .profile import ProfilesLike, ProfileVector, as_profiles, breakpoints_of, values_at
+from .profile import (
+    ProfilesLike,
+    ProfileVector,
+    as_profiles,
+    breakpoints_of,
+    values_at,
+)
 from .rod import Rod
 
 Needs = Literal["rotation", "pose"]
@@ -228,21 +234,24 @@ class _Magnetic(PoseLoad):
     def check(self, rod: Rod) -> None:
         if not callable(self.field):
             return
-        shape = jax.eval_shape(self.field, jnp.zeros(3)).shape
+        shape = jax.eval_shape(self._field_at, jnp.zeros(3)).shape
         if shape != (3,):
             raise ValueError(
                 f"{type(self).__name__}.field: got a function that returns shape {shape}, need (3,)"
             )
 
     def _energy(self, moment: Array, rotation: Rotation, position: Position) -> Scalar:
-        B = self.field(position) if callable(self.field) else self.field
-        return -dot(matvec(rotation, moment), B)
+        return -dot(matvec(rotation, moment), self._field_at(position))
+
+    def _field_at(self, position: Position) -> Array:
+        return jnp.asarray(self.field(position) if callable(self.field) else self.field)
 
 
 def _field(name: str, field: Field) -> Array | Callable:
     if not callable(field):
         return numbers(name, field, (3,))
-    return field if isinstance(field, eqx.Module) else _FieldOf(field)
+    whole: Any = field  # a module has numbers that are differentiable
+    return whole if isinstance(field, eqx.Module) else _FieldOf(field)
 
 
 class _FieldOf(eqx.Module):
@@ -250,8 +259,8 @@ class _FieldOf(eqx.Module):
 
     function: Callable = eqx.field(static=True)
 
-    def __call__(self, position: Position) -> Array:
-        return jnp.asarray(self.function(position))
+    def __call__(self, position: Position) -> ArrayLike:
+        return self.function(position)
 
     def __repr__(self) -> str:
         return f"{getattr(self.function, '__name__', 'function')}(r)"

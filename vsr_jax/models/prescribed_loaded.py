@@ -281,8 +281,7 @@ def _solve(kind: Kind, basis: NodalBasis, problem: ArmProblem) -> Root:
     K = _gathered(basis.matrix, strained, problem.grid)
     sizes = _sizes_of(basis, K, problem, kind)
     size = K.shape[0]
-
-    elastic = c.single(jnp.diagonal(K).T if K.ndim == 2 else jnp.moveaxis(jnp.diagonal(K), -1, 0))
+    elastic = c.single(lu.diagonal(K))
 
     def evaluate(unknown: GalerkinUnknown, damping: Array, share: Array) -> Damped:
         part = problem.with_share(share)
