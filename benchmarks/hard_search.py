@@ -250,6 +250,8 @@ def verdict(draw: Draw) -> str:
         return (
             f"converged, but twice the steps say {vsr.Status(int(found.fine_status)).name.lower()}"
         )
+    if np.any(np.isnan(found.strain)):
+        return "converged, but no strain between two nodes"
     if not residual(draw, forces, found.strain) < BALANCED[draw.weight > 0]:
         return "wrong: not in balance"
     same = np.linalg.norm(found.fine_tip - found.tip) <= SAME * draw.length

@@ -292,3 +292,32 @@ def test_two_hundred_drawn_arms_are_right_or_say_why():
     assert counts["converged"] > 50
     # a section may collapse between two nodes; twice the steps see it
     assert sum(count for said, count in counts.items() if "twice" in said) <= 4
+
+
+def test_a_strain_that_is_not_found_between_the_nodes_is_not_returned():
+    """Two tendons that pull with 2.3 EA and turn half a turn per step: between the nodes Newton's
+    method ended at a strain that balances nothing, thirty times smaller than the right one."""
+    length, radius, young = 0.12079966310965266, 0.00463997, 34937.14525271554
+    rod = vsr.Rod(
+        length,
+        vsr.Circular(radius),
+        vsr.Material(young, poisson=0.45, density=10.874),
+        guide_radius=2 * radius,
+    )
+    scene = vsr.Scene(
+        rod,
+        [
+            vsr.Thread(vsr.Helix(0.01 * radius, pitch=length / turns, phase=phase))
+            for turns, phase in ((23.699821378166515, 5.077552571156068), (1.0, 5.79932145978279))
+        ],
+        [vsr.Gravity((0.0881384, 0.0, 9.8096)), vsr.TipWrench(moment=(0.0, -1.05286e-7, 0.0))],
+    )
+    forces, X = [-2.26963694, -2.85664578], jnp.linspace(0.05, 0.95, 101) * length
+    coarse, fine = (
+        vsr.solve(scene, forces, model=vsr.StrainDependent(steps), throw=True).strain(X)[:, 3]
+        for steps in (16, 64)
+    )
+    found = ~np.isnan(coarse)
+    assert np.all(np.isfinite(fine))
+    assert 0.3 < np.mean(found) < 1.0
+    np.testing.assert_allclose(coarse[found], fine[found], rtol=0.05)

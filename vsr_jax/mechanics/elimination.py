@@ -50,7 +50,7 @@ class EliminationCell(NamedTuple):
     r"""Coefficients of one cell that do not depend on P, in the frame of its section. An affine
     function of the rotation $\theta$ at its start is a matrix with the constant as fourth column.
 
-    - `width` w; `turn`: rotation of the next node's section in this frame.
+    - `width` w; `turn`: rotation of the next node's section in this frame; `reaction`: the moment.
     - $\kappa = $ `compliance` $\delta m$ + `by_theta` $\theta$, affine, with $\delta m$ the part
       from P at the middle of the cell.
     - Over the cell the moment changes by `moment` $\theta$ (affine) + `by_bend` $\kappa$.
@@ -62,6 +62,7 @@ class EliminationCell(NamedTuple):
 
     width: Array
     turn: Array
+    reaction: Array
     compliance: Array
     by_theta: Array
     moment: Array
@@ -167,6 +168,7 @@ def _cell_of(
     cell = EliminationCell(
         w,
         turn,
+        rows(node.wrench, 0, 3),
         compliance,
         matmul(compliance, drive),
         doubled + matmul(lever, matmul(flexibility, linear)),
@@ -210,8 +212,9 @@ def _cell(end: Array, cell: EliminationCell) -> tuple[Array, tuple]:
     adjugate, det = stacked.adjugate(pivot)
     negative = _negative(stacked.trace(pivot), stacked.trace(adjugate), det)
     X = matmul(adjugate, Q + cell.by_theta) / det
-    asymmetry = asymmetry_of(columns(P[:3], 0, 3), cell.compliance)
     start = whole + cell.moment + matmul(width * columns(whole, 0, 3) + cell.by_bend, X)
+    by_rotation = 0.5 * (columns(P[:3], 0, 3) + columns(start, 0, 3))
+    asymmetry = asymmetry_of(by_rotation, cell.reaction, cell.compliance)
     if cell.axis is None:
         return start, (X, None, negative, asymmetry)
     force, by_bend = P[3:], width * columns(P[3:], 0, 3)

@@ -20,8 +20,8 @@ cables can stabilise."""
 
 
 _ASYMMETRIC = 0.2
-"""Antisymmetric part of the stiffness of the arm beyond a section, in units of EI / L, above which
-the pivots may miss a pair of negative eigenvalues."""
+"""Part without potential of the stiffness of the arm beyond a section, in units of EI / L, above
+which the pivots may miss a pair of negative eigenvalues."""
 
 
 class Node(NamedTuple):
@@ -97,8 +97,7 @@ def node_components(strain: Array, grid: Grid) -> Vector:
 
 def definiteness(negative: Array, local: Array, asymmetry: Array, grid: Grid) -> Definiteness:
     """From the number of negative eigenvalues of the pivots of each cell, whether its section is
-    stable by itself, and the antisymmetric part of the stiffness beyond it in units of EI per
-    length of the arm."""
+    stable by itself, and its `asymmetry_of`."""
     total = jnp.sum(negative, axis=0, dtype=jnp.int32)
     return Definiteness(
         jnp.where(jnp.all(local, axis=0), total, UNSTABLE_SECTION),
@@ -152,10 +151,18 @@ def _jumps(slopes: Slopes, grid: Grid) -> Array | None:
     return total
 
 
-def asymmetry_of(by_rotation: Array, compliance: Array) -> Array:
-    """Antisymmetric part of the stiffness of the arm beyond a cell times the compliance of its
-    section per length, 1/m."""
-    a, c = by_rotation, jnp.abs(compliance)
-    apart = [jnp.abs(a[i, j] - a[j, i]) for i, j in ((0, 1), (1, 2), (2, 0))]
+def asymmetry_of(by_rotation: Array, moment: Array, compliance: Array) -> Array:
+    r"""Part of the stiffness of the arm beyond a cell that has no potential, times the compliance
+    of its section per length, 1/m.
+
+    The moment $m(R)$ of a potential changes with a rotation $\theta$ by $\delta m = P \theta$ where
+    $P^T - P = \tilde m$, since rotations do not commute.
+
+    **Arguments:** `by_rotation`: P (3, 3, ...); `moment`: m (3, ...).
+    """
+    a, m, c = by_rotation, moment, jnp.abs(compliance)
+    apart = [
+        jnp.abs(a[(k + 2) % 3, (k + 1) % 3] - a[(k + 1) % 3, (k + 2) % 3] + m[k]) for k in range(3)
+    ]
     softest = jnp.maximum(jnp.maximum(c[0, 0], c[1, 1]), c[2, 2])
     return softest * jnp.maximum(jnp.maximum(apart[0], apart[1]), apart[2])

@@ -41,7 +41,7 @@ from .reaction import Reaction, Slopes
 class PoseCell(NamedTuple):
     r"""Coefficients of one cell that do not depend on P.
 
-    - `width` w; `turn`: rotation of the next node's section in this frame.
+    - `width` w; `turn`: rotation of the next node's section in this frame; `reaction`: the moment.
     - `lever` $-\frac w2 \tilde u$: the motion in the middle of the cell is $Z (z + \frac w2
       \delta\xi)$ with $Z = (1, 0; \text{lever}, 1)$.
     - `stiff`: the 6 x 6 system without P; `drive`, `right`: its right side per motion, and b.
@@ -52,6 +52,7 @@ class PoseCell(NamedTuple):
 
     width: Array
     turn: Array
+    reaction: Array
     lever: Array
     stiff: Array
     drive: Array
@@ -108,6 +109,7 @@ def _cell_of(node: Node, turn: Array) -> PoseCell:
     return PoseCell(
         w,
         turn,
+        rows(node.wrench, 0, 3),
         lever,
         H - 0.5 * (w * drive + by_strain),
         drive,
@@ -138,8 +140,9 @@ def _cell(free: tuple[int, ...], end: Array, cell: PoseCell) -> tuple[Array, tup
     square = once(_from_right(columns(start, 0, 6), lever))
     by_start = 2.0 * square - columns(start, 0, 6) + cell.by_motion
     start = jnp.concatenate([by_start, columns(start, 6, 7)], axis=1)
-    asymmetry = asymmetry_of(columns(P[:3], 0, 3), compliance)
-    return start + matmul(w * square + cell.by_strain, X), (X, negative, asymmetry)
+    start = start + matmul(w * square + cell.by_strain, X)
+    by_rotation = 0.5 * (P[:3, :3] + start[:3, :3])
+    return start, (X, negative, asymmetry_of(by_rotation, cell.reaction, compliance))
 
 
 def _solved(D: Array, right: Array, free: tuple[int, ...]) -> tuple[Array, Array, Array]:

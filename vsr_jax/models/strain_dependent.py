@@ -13,7 +13,15 @@ from jaxtyping import Array, Float
 from ..arm.scene import Scene, shared
 from ..mechanics.arm_balance import ArmUnknown, carried_forces, problem_of, shares_at, with_tensions
 from ..mechanics.arm_solve import solve_arm
-from ..mechanics.balance import forces_where, newton_step, solve_balance, spread
+from ..mechanics.balance import (
+    forces_where,
+    free_components,
+    newton_step,
+    residual,
+    solve_balance,
+    spread,
+    strain_norm,
+)
 from ..mechanics.reaction import loading, react_at
 from ..numerics.component import Forces, Vector
 from ..numerics.magnus import ORDERS
@@ -122,7 +130,13 @@ class StrainDependent(SteppedModel):
         reaction = None if loads is None else react_at(state.xi, grid, loads, X)
         tau = shared(forces, shares_at(scene, state.xi, state.turning, grid, X))
         start = tuple(jnp.interp(X, grid.X.T.reshape(-1), x.T.reshape(-1)) for x in state.xi)
-        return solve_balance(scene.sections(X), tau, reaction, scene.free, start).xi
+        sections = scene.sections(X)
+        xi = solve_balance(sections, tau, reaction, scene.free, start).xi
+        off = free_components(residual(xi, sections, tau, reaction), scene.free)
+        size = strain_norm(spread(off, scene.free), sections.stiffness)
+        # near collapse the strain between unresolved nodes may not be found
+        found = jnp.where(size <= jnp.finfo(size.dtype).eps ** 0.5, 1.0, jnp.nan)
+        return tuple(found.astype(x.dtype) * x for x in xi)
 
 
 def _status_of_ends(scene: Scene, forces: Forces, xi: Vector) -> Array:
