@@ -111,12 +111,22 @@ def eliminate(
         return spread(x, free), Definiteness(negative, jnp.zeros_like(unstable))
     nodes = nodes_of(c.symmetric(lower), right, xi, along, slopes, grid)
     follows = slopes.motion > 0
-    cells, linear, local = jax.vmap(partial(_cell_of, free=free, follows=follows))(
-        nodes, turns(nodes.rotation)
-    )
-    arms = nodes.weight.shape[1:]
-    nothing = jnp.zeros((6 if follows else 3, 4, *arms), cells.width.dtype)
-    _, (X, push, negative, asymmetry) = lax.scan(_cell, nothing, cells, reverse=True)
+    of_node = partial(_cell_of, free=free, follows=follows)
+    relative, arms = turns(nodes.rotation), nodes.weight.shape[1:]
+    nothing = jnp.zeros((6 if follows else 3, 4, *arms), nodes.weight.dtype)
+    if arms:  # of a batch one cell at a time, which stays in the cache
+
+        def backward(end: Array, node: tuple[Node, Array]) -> tuple[Array, tuple]:
+            cell, linear, local = of_node(*jax.tree.map(once, node))
+            start, found = _cell(end, cell)
+            return start, (found, linear, local)
+
+        _, ((X, push, negative, asymmetry), linear, local) = lax.scan(
+            backward, nothing, (nodes, relative), reverse=True
+        )
+    else:
+        cells, linear, local = jax.vmap(of_node)(nodes, relative)
+        _, (X, push, negative, asymmetry) = lax.scan(_cell, nothing, cells, reverse=True)
 
     def forward(theta: Array, cell: tuple) -> tuple[Array, tuple[Array, Array]]:
         X, turn, width = jax.tree.map(once, cell)
@@ -124,8 +134,8 @@ def eliminate(
         return matvec(transpose(turn), theta + width * kappa), (theta, kappa)
 
     start = jnp.zeros((3, *arms), X.dtype)
-    _, (theta, kappa) = lax.scan(forward, start, (X, cells.turn, cells.width))
-    strain = jax.vmap(_strain)(linear, cells.width, push, theta, kappa)
+    _, (theta, kappa) = lax.scan(forward, start, (X, relative, nodes.weight))
+    strain = jax.vmap(_strain)(linear, nodes.weight, push, theta, kappa)
     return node_components(strain, grid), definiteness(negative, local, asymmetry, grid)
 
 
