@@ -6,7 +6,7 @@ reference length and $(M, F)$ [N m, N] at a point. Moments are about the point o
 load acts.
 """
 
-from typing import ClassVar, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -24,11 +24,10 @@ Frame = Literal["world", "body"]
 
 class Load(Part):
     """A load on the arm: a wrench per length or a wrench at a point, constant in the world frame or
-    in the body frame. One that depends on the pose of its section is a `PoseLoad`, `by_pose`."""
+    in the body frame. One that depends on the pose of its section is a `PoseLoad`."""
 
     frame: eqx.AbstractVar[Frame]
     effect: eqx.AbstractClassVar[str]
-    by_pose: ClassVar[bool] = False
 
     @property
     def effects(self) -> tuple[str, ...]:

@@ -48,7 +48,6 @@ class PoseLoad(Load):
     """
 
     frame: Frame = eqx.field(static=True, default="world", init=False)
-    by_pose = True
 
     @property
     def needs(self) -> Needs:

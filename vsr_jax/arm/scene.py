@@ -179,8 +179,8 @@ class Scene(Part):
         """Sum $(c, f)$ of the loads per length of a frame at abscissas X of any shape; None
         if there are none."""
         total = None
-        for load in self.loads:
-            if load.by_pose or load.frame != frame or load.point(self.rod) is not None:
+        for load in self._fixed(frame):
+            if load.point(self.rod) is not None:
                 continue
             here = jax.vmap(lambda x, load=load: load.density(self.rod, x) or ())(X.reshape(-1))
             here = jax.tree.map(lambda x: jnp.broadcast_to(x, X.size).reshape(X.shape), here)
@@ -189,9 +189,12 @@ class Scene(Part):
 
     def point_wrenches(self, frame: Frame) -> tuple[tuple[Scalar, Wrench], ...]:
         """Abscissa and wrench $(M, F)$ of each load of a frame that acts at a point."""
-        fixed = [load for load in self.loads if not load.by_pose and load.frame == frame]
-        points = [load.point(self.rod) for load in fixed]
+        points = [load.point(self.rod) for load in self._fixed(frame)]
         return tuple(point for point in points if point is not None)
+
+    def _fixed(self, frame: Frame) -> list[Load]:
+        """The loads whose wrench is constant in a frame."""
+        return [x for x in self.loads if x.frame == frame and not isinstance(x, PoseLoad)]
 
     @property
     def pose_loads(self) -> tuple[PoseLoad, ...]:
