@@ -264,6 +264,8 @@ def _seen(
 ) -> tuple[tuple[Array, Array | None], ...]:
     """Rotation and position where each load acts that depends on the pose; None for positions if no
     load depends on them."""
+    if not loads.by_pose:
+        return ()
     positions = loads.motion == 6
     base = jnp.asarray(base_pose(loads.base, grid.h.dtype))[:3, 3]
     base = base.reshape(3, 1, 1, *base.shape[1:], *(1,) * (axis.ndim - 2 - base.ndim))
