@@ -19,9 +19,11 @@ UNSTABLE_SECTION = 1_000_000
 cables can stabilise."""
 
 
-_ASYMMETRIC = 0.2
+_ASYMMETRIC = 1.5
 """Part without potential of the stiffness of the arm beyond a section, in units of EI / L, above
-which the pivots may miss a pair of negative eigenvalues."""
+which the pivots may miss a pair of negative eigenvalues. Half of the least at which they do: the
+stiffness of a bent rod of length L that loses stability passes through infinity; with an imaginary
+part in place of a pole it passes through at least pi i / 2, an asymmetry of pi."""
 
 
 class Node(NamedTuple):
