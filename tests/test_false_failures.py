@@ -12,6 +12,7 @@ import vsr_jax as vsr
 from benchmarks.false_failures import search
 from benchmarks.load_steps import Arm
 from benchmarks.ordinary_scenes import STRUCTURES, built
+from vsr_jax.mechanics import elimination_nodes
 
 GREENHILL = 7.8373
 
@@ -90,3 +91,27 @@ def test_an_upright_arm_with_a_chamber_at_rest_stands_or_is_unstable():
     np.testing.assert_array_equal(
         solved(stack(drawn)), np.where(stands, vsr.Status.CONVERGED, vsr.Status.UNSTABLE)
     )
+
+
+def test_two_unstable_motions_that_the_pivots_miss_are_found(monkeypatch):
+    """A dead moment makes the tangent asymmetric: two negative real eigenvalues leave all pivots of
+    the elimination positive, and without the probe the equilibrium is called converged."""
+    structure, draw = STRUCTURES["dead wrenches, three tendons"], 108
+    numbers = draws("dead wrenches, three tendons", draw + 1)[draw]
+    L, arm = numbers["length"], Arm(structure, numbers)
+
+    def real_margin():
+        """Least real eigenvalue of the independent tangent at the solution."""
+        jax.clear_caches()
+        eq = vsr.solve(*built(structure, numbers), model=vsr.StrainDependent(16), throw=True)
+        strain = np.asarray(eq.strain(arm.middle * L)) * np.array([L, L, L, 1, 1, 1])
+        found = arm.balance(strain, np.zeros(0), 1.0)
+        assert found is not None
+        assert np.linalg.norm(arm.tip(found[0]) - eq.tip[:3, 3] / L) < 0.02
+        return found[2].real
+
+    assert real_margin() > 0
+    with monkeypatch.context() as blind:
+        blind.setattr(elimination_nodes, "_ASYMMETRIC", np.inf)
+        assert real_margin() < -0.5
+    jax.clear_caches()
