@@ -11,7 +11,7 @@ from jaxtyping import Array
 from ..numerics import stacked
 from ..numerics.component import Matrix, Vector
 from ..numerics.quadrature import Grid
-from ..numerics.stacked import matmul, rows, transpose
+from ..numerics.stacked import columns, matmul, rows, transpose
 from .reaction import Reaction, Slopes
 
 UNSTABLE_SECTION = 1_000_000
@@ -108,10 +108,11 @@ def definiteness(negative: Array, local: Array, asymmetry: Array, grid: Grid) ->
 
 
 def seen_from(R: Array, slope: Array) -> Array:
-    """A derivative (6, 3, ...) of a wrench by a rotation, in the frame of a section."""
+    """A derivative (6, motion, ...) of a wrench by a motion, in a frame with the rotation R."""
     back = transpose(R)
-    parts = [matmul(matmul(back, rows(slope, i, i + 3)), R) for i in (0, 3)]
-    return jnp.concatenate(parts)
+    seen = jnp.concatenate([matmul(back, rows(slope, i, i + 3)) for i in (0, 3)])
+    parts = [matmul(columns(seen, i, i + 3), R) for i in range(0, slope.shape[1], 3)]
+    return parts[0] if len(parts) == 1 else jnp.concatenate(parts, axis=1)
 
 
 def inverse_block(matrix: Array, places: tuple[int, ...]) -> tuple[Array, Array]:

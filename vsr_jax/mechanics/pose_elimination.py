@@ -24,7 +24,7 @@ from jaxtyping import Array
 from ..numerics import component as c
 from ..numerics.component import Matrix, Vector
 from ..numerics.quadrature import Grid
-from ..numerics.stacked import columns, matmul, matvec, once, rows, skew, transpose
+from ..numerics.stacked import affine, columns, matmul, matvec, once, rows, skew, transpose, turned
 from .elimination_nodes import (
     Definiteness,
     Node,
@@ -33,6 +33,7 @@ from .elimination_nodes import (
     inverse_block,
     node_components,
     nodes_of,
+    seen_from,
     turns,
 )
 from .reaction import Reaction, Slopes
@@ -80,13 +81,11 @@ def eliminate_poses(
 
     def forward(z: Array, cell: tuple) -> tuple[Array, Array]:
         X, turn, lever, width = jax.tree.map(once, cell)
-        strain = matvec(columns(X, 0, 6), z) + X[:, 6]
+        strain = affine(X, z)
         middle = z + 0.5 * width * strain
         sheared = rows(middle, 3, 6) + matvec(lever, rows(middle, 0, 3))
         end = 2.0 * jnp.concatenate([rows(middle, 0, 3), sheared]) - z
-        back = transpose(turn)
-        parts = [matvec(back, rows(end, i, i + 3)) for i in (0, 3)]
-        return jnp.concatenate(parts), strain
+        return turned(transpose(turn), end), strain
 
     start = jnp.zeros((6, *arms), X.dtype)
     _, strain = lax.scan(forward, start, (X, cells.turn, cells.lever, cells.width))
@@ -126,9 +125,10 @@ def _cell(free: tuple[int, ...], end: Array, cell: PoseCell) -> tuple[Array, tup
     of the cell."""
     cell = jax.tree.map(once, cell)
     w, lever = cell.width, cell.lever
-    P = _turned(cell.turn, end)
+    by_motion = seen_from(transpose(cell.turn), columns(end, 0, 6))
     if cell.jump is not None:
-        P = P + jnp.concatenate([cell.jump, jnp.zeros_like(columns(P, 6, 7))], axis=1)
+        by_motion = by_motion + cell.jump
+    P = jnp.concatenate([by_motion, turned(cell.turn, end[:, 6])[:, None]], axis=1)
     middle = _from_left(lever, P)  # of the wrench in the middle of the cell
     square = once(_from_right(columns(middle, 0, 6), lever))
     by_start = 2.0 * square - columns(middle, 0, 6) + cell.drive
@@ -175,19 +175,3 @@ def _from_right(a: Array, lever: Array) -> Array:
     r"""$A Z$ of a matrix with six columns."""
     left = columns(a, 0, 3) + matmul(columns(a, 3, 6), lever)
     return jnp.concatenate([left, columns(a, 3, 6)], axis=1)
-
-
-def _turned(turn: Array, P: Array) -> Array:
-    """An affine function (6, 7) of the motion of a section, in a frame from which the section's
-    frame is seen with a rotation."""
-    seen = jnp.concatenate([matmul(turn, rows(P, i, i + 3)) for i in (0, 3)])
-    back = transpose(turn)
-    parts = [matmul(columns(seen, i, i + 3), back) for i in (0, 3)]
-    return jnp.concatenate([*parts, columns(seen, 6, 7)], axis=1)
-
-
-def seen_from(R: Array, slope: Array) -> Array:
-    """A derivative (6, 6, ...) of a wrench by a motion, in the frame of a section."""
-    back = transpose(R)
-    none = jnp.zeros_like(columns(slope, 0, 1))
-    return columns(_turned(back, jnp.concatenate([slope, none], axis=1)), 0, 6)

@@ -16,7 +16,7 @@ from ..arm.pose_loads import PoseLoad
 from ..arm.rod import Rod
 from ..arm.scene import Scene
 from ..numerics.batching import arms_in
-from ..numerics.quadrature import Grid
+from ..numerics.quadrature import Grid, before_point
 from ..numerics.se3 import base_pose
 from ..numerics.stacked import matmul, skew
 
@@ -37,8 +37,8 @@ class PoseTerm(NamedTuple):
         """Wrench or density in the world frame, (6, ...), where the sections have a rotation (3, 3,
         ...) and a position (3, ...); None if no load depends on it."""
 
-        def of_section(load: PoseLoad, rod: Rod, X: Array, R: Array, r: Array) -> Array:
-            return load.wrench(rod, X, R, r)
+        def of_section(load: PoseLoad, *section: Any) -> Array:
+            return load.wrench(*section)
 
         return self.share * self._each(of_section, rotation, position)
 
@@ -102,8 +102,7 @@ def pose_terms(scene: Scene, grid: Grid) -> tuple[PoseTerm, ...]:
         if X is None:
             terms.append(PoseTerm(load, scene.rod, one, grid.X, None, None))
         else:
-            step, before = jnp.sum(grid.start < X), (grid.X < X).astype(grid.h.dtype)
-            terms.append(PoseTerm(load, scene.rod, one, X, step, before))
+            terms.append(PoseTerm(load, scene.rod, one, X, *before_point(grid, X)))
     return tuple(terms)
 
 

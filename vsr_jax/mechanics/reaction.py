@@ -24,6 +24,7 @@ from ..numerics.magnus import magnus_6
 from ..numerics.quadrature import (
     Grid,
     before,
+    before_point,
     beyond,
     gauss_legendre,
     interpolation,
@@ -172,7 +173,7 @@ def loading(scene: Scene, grid: Grid) -> Loading | None:
         parts.append(jnp.where(grid.X < X, stack(wrench)[:, None, None], 0.0))
     dead = sum(parts[1:], parts[0]) if parts else None
     points = tuple(
-        FollowerPoint(jnp.sum(grid.start < X), (grid.X < X).astype(X.dtype), stack(wrench))
+        FollowerPoint(*before_point(grid, X), stack(wrench))
         for X, wrench in scene.point_wrenches("body")
     )
     return Loading(dead, density, follower, points, pose_terms(scene, grid), scene.rod.base)

@@ -241,7 +241,7 @@ def damped_newton(
         new_step = jax.tree.map(lambda s, last: s + more.astype(s.dtype) * last, new.step, step)
         pull = jnp.where(taken, measures.work(new.residual, new_step), guard.pull)
         go = going(old)
-        ratio = jnp.where(probe, measures.turn(new_step) / measures.turn(step), 0.0)
+        ratio = measures.turn(new_step) / measures.turn(step)
         guard = select(go, guard._replace(pull=pull), _probed(old, probe, ratio))
         x = select(go & taken, trial, x)
         if not twice:
@@ -272,21 +272,21 @@ def _careful(floor: Array, increments: int) -> _Guard:
     none = jnp.zeros(floor.shape, jnp.int32)
     damping = jnp.full_like(floor, 0.0 if increments > 1 else _MIN_DAMPING)
     return _Guard(
-        zero,
-        zero,
-        zero + jnp.inf,
-        ~no,
-        zero,
-        damping,
-        zero + 1,
-        no,
-        none,
-        no,
-        none,
-        none,
-        no,
-        none,
-        zero + 1,
+        size=zero,
+        miss=zero,
+        merit=zero + jnp.inf,
+        definite=~no,
+        pull=zero,
+        damping=damping,
+        applied=zero + 1,
+        fresh=no,
+        rises=none,
+        gradual=no,
+        spent=none,
+        plain=none,
+        doubtful=no,
+        probes=none,
+        growth=zero + 1,
     )
 
 

@@ -139,6 +139,11 @@ def before(density: Array, grid: Grid) -> Array:
     return sum_along(density, grid) - beyond(density, grid)
 
 
+def before_point(grid: Grid, X: Scalar) -> tuple[Array, Array]:
+    """Number of steps that start before X, and 1 at the nodes before X, 0 beyond."""
+    return jnp.sum(grid.start < X), (grid.X < X).astype(grid.h.dtype)
+
+
 def locate(grid: Grid, X: Array) -> tuple[Array, Array]:
     """Step in which each abscissa lies, and its place in the step as a fraction."""
     step = jnp.clip(jnp.searchsorted(grid.start, X, side="right") - 1, 0, grid.start.size - 1)

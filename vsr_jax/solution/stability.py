@@ -10,9 +10,8 @@ R^T (\delta n - \theta \times n)), \quad
 -\delta n' = \delta f, \quad -\delta m' = \rho' \times n + p' \times \delta n + \delta c,$$
 
 with the displacement $\rho' = \theta \times p' + R \upsilon$ and the changes of the load densities
-by rotation and displacement. A product with the tangent thus takes a few
-sums along the arm. It is the exact derivative of the discrete residual: $\theta$ is that of the
-Magnus steps.
+by rotation and displacement. A product with the tangent thus takes a few sums along the arm. It is
+the exact derivative of the discrete residual: $\theta$ is that of the Magnus steps.
 """
 
 from functools import partial
