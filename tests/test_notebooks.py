@@ -1,8 +1,10 @@
-"""Notebooks: that they are stored without outputs, begin with a title and hold Python that
-compiles."""
+"""Notebooks: that they are stored without outputs, begin with a title, hold Python that compiles,
+and use only names that the package has. Running them takes minutes: `benchmarks/run_notebooks.py`
+does."""
 
 import ast
 import json
+from functools import reduce
 from pathlib import Path
 
 import pytest
@@ -34,12 +36,33 @@ def test_outputs_are_stripped(path):
         assert cell["execution_count"] is None
 
 
+def code_of(path):
+    """Syntax tree of all code cells, without the commands of the notebook."""
+    cells = [cell for cell in read(path)["cells"] if cell["cell_type"] == "code"]
+    lines = [line for cell in cells for line in text_of(cell).splitlines()]
+    return ast.parse("\n".join(line for line in lines if not line.lstrip().startswith(("%", "!"))))
+
+
+def dotted(node):
+    """The names of `a.b.c`, or None for other expressions."""
+    names = []
+    while isinstance(node, ast.Attribute):
+        names.append(node.attr)
+        node = node.value
+    return (node.id, *reversed(names)) if isinstance(node, ast.Name) else None
+
+
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_code_compiles(path):
-    for cell in read(path)["cells"]:
-        if cell["cell_type"] == "code":
-            lines = text_of(cell).splitlines()
-            ast.parse("\n".join(line for line in lines if not line.lstrip().startswith(("%", "!"))))
+def test_every_name_of_the_package_exists(path):
+    nodes, imported = list(ast.walk(code_of(path))), {}
+    for node in nodes:
+        if isinstance(node, ast.Import | ast.ImportFrom) and "vsr_jax" in ast.unparse(node):
+            exec(compile(ast.Module([node], []), path.name, "exec"), imported)
+    assert imported
+    for node in nodes:
+        names = dotted(node) if isinstance(node, ast.Attribute) else None
+        if names and names[0] in imported:
+            reduce(getattr, names[1:], imported[names[0]])
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
