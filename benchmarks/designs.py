@@ -190,6 +190,7 @@ def main() -> None:
     )
     parser.add_argument("--out", metavar="FOLDER", type=Path, default=Path("benchmarks/results"))
     out = parser.parse_args().out
+    out.mkdir(parents=True, exist_ok=True)
     jax.config.update("jax_enable_x64", True)
     (s, s_said), (line, line_said) = follow_the_s(), along_the_line()
     for name, said in (("S", s_said), ("line", line_said)):
