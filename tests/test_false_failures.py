@@ -103,7 +103,7 @@ def test_two_unstable_motions_that_the_pivots_miss_are_found(monkeypatch):
     def real_margin():
         """Least real eigenvalue of the independent tangent at the solution."""
         jax.clear_caches()
-        eq = vsr.solve(*built(structure, numbers), model=vsr.StrainDependent(16), throw=True)
+        eq = vsr.solve(*built(structure, numbers), model=vsr.StrainDependent(24), throw=True)
         strain = np.asarray(eq.strain(arm.middle * L)) * np.array([L, L, L, 1, 1, 1])
         found = arm.balance(strain, np.zeros(0), 1.0)
         assert found is not None

@@ -60,7 +60,7 @@ def approximate_solve(
     def solve(b: Vector) -> tuple[Vector, Definiteness]:
         if along is not None and slopes is not None and slopes.motion == 6:
             return eliminate_poses(lower, b, unknown.xi, along, slopes, grid, kind.free)
-        return eliminate(lower, b, unknown.xi, along, slopes, grid, kind.free)
+        return eliminate(lower, b, along, slopes, grid, kind.free)
 
     strain, (negative, doubtful) = solve(spread(right.wrench, kind.free))
     if not kind.cables:

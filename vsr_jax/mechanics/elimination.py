@@ -1,92 +1,123 @@
 r"""The tangent of the balance of all cross-sections, solved by block elimination along the arm.
 
-In the frame of each section a change of strain $(\kappa, \upsilon)$ rotates the sections beyond
-it, $\theta' = \kappa$, and changes the reaction at a node. With $(m, n)$ the wrench at the node,
-$(\delta m, \delta n)$ its change and $u$ the axis,
+In the world frame a change of strain $(\kappa, \upsilon)$ rotates the sections beyond it, $\theta'
+= \kappa$, and changes the reaction at a node. With $(m, n)$ the wrench at the node, $(\delta m,
+\delta n)$ its change and $u = p'$ the axis,
 
 $$H \, \delta\xi = (\delta m - \theta \times m, \ \delta n - \theta \times n) + b, \quad
 -\delta m' = (\theta \times u + \upsilon) \times n + u \times \delta n + C \theta, \quad
 -\delta n' = F \theta,$$
 
 where C and F are the derivatives of the load densities by the rotation. Loads that depend on
-positions are the matter of `pose_elimination`. Each node represents a cell whose length is its
-weight w, integrated by the midpoint rule. The linear strains depend on other nodes through the
-rotations only, so they are eliminated first, for all nodes at once. A pass from the tip to the base
-then keeps the change of the wrench as an affine function of the rotation, $P \theta + p$, and
-solves a 3 x 3 system per cell; a pass from the base to the tip gives the rotations. The error of
-the tangent is of the order of the distance between nodes: as a preconditioner of the exact one it
-gains one to two digits per application.
+positions are the matter of `pose_elimination`. The integrals over a step are those of the residual,
+exact for polynomials through its nodes (Gauss collocation), so that the tangent differs from the
+exact one only by the derivative of the rotations within a step, of the order of the steps.
+
+The linear strains are eliminated at each node. The balance of the nodes of a step, a system of 3 x
+3 blocks, then gives their bending by the rotation at the start of the step, the wrench at its end
+and the right side. A pass from the tip to the base keeps the change of the wrench as an affine
+function of the rotation, $P \theta + p$, and solves a 3 x 3 system per step; a pass from the base
+to the tip gives the rotations. Matrices and the vectors that depend on b are kept apart, so that
+the derivative by b and its transpose are small programs.
 """
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array
 
 from ..numerics import component as c, stacked
-from ..numerics.component import Matrix, Vector
-from ..numerics.quadrature import Grid
-from ..numerics.stacked import affine, columns, matmul, matvec, once, rows, skew, transpose
+from ..numerics.component import Matrix, Tree, Vector
+from ..numerics.quadrature import Grid, collocation, gauss_legendre, remaining, weighted
+from ..numerics.stacked import columns, matmul, matvec, once, rows, skew, transpose, turned
 from .balance import free_block, free_components, spread
 from .elimination_nodes import (
     UNSTABLE_SECTION,
     Definiteness,
-    Node,
     asymmetry_of,
     definiteness,
     inverse_block,
-    node_components,
-    nodes_of,
-    seen_from,
-    turns,
 )
 from .reaction import Reaction, Slopes
 
 
-class EliminationCell(NamedTuple):
-    r"""Coefficients of one cell that do not depend on P, in the frame of its section. An affine
-    function of the rotation $\theta$ at its start is a matrix with the constant as fourth column.
+class StepNodes(NamedTuple):
+    r"""What the elimination needs of the nodes of a step, in the world frame but for H and b: the
+    length h of the step; the rotations, the blocks of H (3, 3), the right side b (6), the axis u,
+    the wrench (6) and its density (6); the derivatives (6, 3) of the load density at the nodes and
+    of the loads at the end of the step by rotations, None where there are none.
 
-    - `width` w; `turn`: rotation of the next node's section in this frame; `reaction`: the moment.
-    - $\kappa = $ `compliance` $\delta m$ + `by_theta` $\theta$, affine, with $\delta m$ the part
-      from P at the middle of the cell.
-    - Over the cell the moment changes by `moment` $\theta$ (affine) + `by_bend` $\kappa$.
-    - With loads that turn only, else None: the effect of the change of the force on the strain,
-      `by_push`, and on the moment, `stretch`; the `axis` u; `force`, the change of the force over
-      half the cell per rotation (None without density); `jump`, the derivative of the wrench at the
-      end of the cell (None without points).
+    Behind the components come the axis of the nodes (but for h and `jump`) and those of steps or
+    arms.
     """
 
-    width: Array
-    turn: Array
-    reaction: Array
+    h: Array
+    rotation: Array
+    bending: Array
+    mixed: Array
+    linear: Array
+    right: Array
+    axis: Array
+    wrench: Array
+    density: Array
+    slope: Array | None
+    jump: Array | None
+
+
+class Sections(NamedTuple):
+    """The nodes of a step each alone, in the world frame: the `compliance` of bending, the
+    `flexibility` of the linear strains, the bending moment `across` per force on them, the change
+    of the moment per length `pull` by the linear strain that a force causes; the bending `moment`
+    and the `force` of the right side."""
+
     compliance: Array
-    by_theta: Array
-    moment: Array
-    by_bend: Array
-    by_push: Array | None = None
-    stretch: Array | None = None
-    axis: Array | None = None
-    force: Array | None = None
-    jump: Array | None = None
-
-
-class EliminatedLinear(NamedTuple):
-    r"""The eliminated linear strains of a node: `flexibility` $(\delta n$ + `by_theta` $\theta)
-    -$ `by_bend` $\kappa$, with $\delta n$ the part of the force from P; `by_theta` is affine."""
-
     flexibility: Array
-    by_theta: Array
-    by_bend: Array
+    across: Array
+    pull: Array
+    moment: Array
+    force: Array
+
+
+class Condensed(NamedTuple):
+    r"""A step without what lies beyond it. The columns of a map belong to $(\theta_0, \delta m_1,
+    \delta n_1)$: the rotation at the start, and the change of the wrench at the end, of the moment
+    alone if no load turns. To each belongs a vector, its value by the right side alone.
+
+    - `bend` (3, columns, nodes), `bent`: bending $\kappa$ of the nodes.
+    - `turn` (3, columns), `turned`: rotation at the end.
+    - `start` (wrench, columns), `started`: change of the wrench at the start.
+    - `jump` (6, 3): derivative of the loads at the end by their rotation, None without such loads.
+    - `moment`, `compliance`: the moment at the start and the compliance of the first node.
+    """
+
+    bend: Array
+    turn: Array
+    start: Array
+    bent: Array
+    turned: Array
+    started: Array
+    jump: Array | None
+    moment: Array
+    compliance: Array
+
+
+class Joint(NamedTuple):
+    """A step with all that lies beyond it: by the rotation at its start, and by the right side
+    alone, the rotation at its end, `turn` (3, 3) and `turned`, and the change of the wrench there,
+    `wrench` (wrench, 3) and `pulled`."""
+
+    turn: Array
+    turned: Array
+    wrench: Array
+    pulled: Array
 
 
 def eliminate(
     lower: Matrix,
     right: Vector,
-    xi: Vector,
     along: Reaction | None,
     slopes: Slopes | None,
     grid: Grid,
@@ -98,8 +129,9 @@ def eliminate(
     **Arguments:** node arrays of shape (stages, steps, *arms).
     - `lower`: lower triangle of $H$.
     - `right`: $b$, six components.
-    - `xi`, `along`, `slopes`: the strain where the tangent is taken, its reaction and the
-      derivatives of the loads. Without loads only $H$ is solved, node by node.
+    - `along`, `slopes`: the reaction where the tangent is taken, and the derivatives of the loads.
+      Without loads only $H$ is solved, node by node.
+    - `free`: the strains that are not locked.
 
     **Returns:** six components, zero for the locked strains; meaningless where the tangent is not
     definite.
@@ -109,159 +141,283 @@ def eliminate(
         unstable = jnp.any(jnp.isnan(x[-1]), axis=(0, 1))
         negative = jnp.where(unstable, UNSTABLE_SECTION, 0).astype(jnp.int32)
         return spread(x, free), Definiteness(negative, jnp.zeros_like(unstable))
-    nodes = nodes_of(c.symmetric(lower), right, xi, along, slopes, grid)
-    follows = slopes.motion > 0
-    of_node = partial(_cell_of, free=free, follows=follows)
-    relative, arms = turns(nodes.rotation), nodes.weight.shape[1:]
-    nothing = jnp.zeros((6 if follows else 3, 4, *arms), nodes.weight.dtype)
-    if arms:  # of a batch one cell at a time, which stays in the cache
+    nodes = _nodes(c.symmetric(lower), right, along, slopes, grid)
+    nodes, stages = (_apart(nodes, grid), grid.X.shape[0]) if nodes.axis.ndim > 3 else (nodes, 1)
+    arms, size = nodes.axis.shape[3:], 6 if slopes.motion else 3
+    last = -1 - len(arms)  # the axis of the steps
+    nothing = jnp.zeros((size, 3, *arms), nodes.axis.dtype)
+    end = nothing, nothing[:, 0]
+    if arms:  # of a batch one step at a time, which stays in the cache
 
-        def backward(end: Array, node: tuple[Node, Array]) -> tuple[Array, tuple]:
-            cell, linear, local = of_node(*jax.tree.map(once, node))
-            start, found = _cell(end, cell)
-            return start, (found, linear, local)
+        def backward(end: tuple, node: StepNodes) -> tuple[tuple, tuple]:
+            node = jax.tree.map(once, node)
+            sections, step, *found = _condensed(node, free)
+            start, (joint, *others) = _joined(end, step)
+            strain = _by_start(node, sections, step, joint)
+            return start, (joint.turn, joint.turned, strain, *found, *others)
 
-        _, ((X, push, negative, asymmetry), linear, local) = lax.scan(
-            backward, nothing, (nodes, relative), reverse=True
-        )
+        _, found = lax.scan(backward, end, _moved(nodes, last, 0), reverse=True)
+        turn, turned_end, strain, local, stable, negative, asymmetry = found
+        strain = _moved(strain, 0, last)
     else:
-        cells, linear, local = jax.vmap(of_node)(nodes, relative)
-        _, (X, push, negative, asymmetry) = lax.scan(_cell, nothing, cells, reverse=True)
+        sections, step, local, stable = _condensed(nodes, free)
+        _, found = lax.scan(_joined, end, _moved(step, last, 0), reverse=True)
+        joint, negative, asymmetry = found
+        turn, turned_end = joint.turn, joint.turned
+        strain = _by_start(nodes, sections, step, _moved(joint, 0, last))
 
-    def forward(theta: Array, cell: tuple) -> tuple[Array, tuple[Array, Array]]:
-        X, turn, width = jax.tree.map(once, cell)
-        kappa = affine(X, theta)
-        return matvec(transpose(turn), theta + width * kappa), (theta, kappa)
+    def forward(theta: Array, step: tuple) -> tuple[Array, Array]:
+        turn, more = jax.tree.map(once, step)
+        return matvec(turn, theta) + more, theta
 
-    start = jnp.zeros((3, *arms), X.dtype)
-    _, (theta, kappa) = lax.scan(forward, start, (X, relative, nodes.weight))
-    strain = jax.vmap(_strain)(linear, nodes.weight, push, theta, kappa)
-    return node_components(strain, grid), definiteness(negative, local, asymmetry, grid)
-
-
-def _strain(
-    linear: EliminatedLinear, width: Array, push: Array | None, theta: Array, kappa: Array
-) -> Array:
-    """The strain (6,) at a node."""
-    force = affine(linear.by_theta, theta)
-    if push is not None:
-        force = force + affine(push, theta + width * kappa)
-    upsilon = matvec(linear.flexibility, force) - matvec(linear.by_bend, kappa)
-    return jnp.concatenate([kappa, upsilon])
+    _, theta = lax.scan(forward, nothing[:3, 0], (turn, turned_end))
+    by_theta, constant = strain
+    found = matvec(by_theta, jnp.moveaxis(theta, 0, last)[:, None]) + constant
+    found = turned(transpose(nodes.rotation), found)
+    found = found.reshape(6, -1, stages, *arms).swapaxes(1, 2) if arms else found
+    return stacked.components(found), definiteness(negative + local, stable, asymmetry, grid)
 
 
-def _cell_of(
-    node: Node, turn: Array, free: tuple[int, ...], follows: bool
-) -> tuple[EliminationCell, EliminatedLinear, Array]:
-    """All that does not depend on P, for one node, and whether its section is stable by itself."""
-    w = node.weight
-    half, n = 0.5 * w, skew(rows(node.wrench, 3, 6))
-    R = node.rotation
-    density = None if node.density is None else seen_from(R, node.density)
-    moment, by_force, force = _per_rotation(n, skew(node.axis), density, half)
-    moment = once(half * moment)
-    by_theta = moment + skew(rows(node.wrench, 0, 3))
-    flexibility, stretching = inverse_block(node.linear, tuple(i - 3 for i in free if i > 2))
-    mixed = node.mixed + half * n
-    D = matmul(mixed, flexibility)
-    stiff = node.bending - half * by_theta - matmul(D, transpose(mixed))
-    by_bend = transpose(D)
-    if force is not None:
-        stiff = stiff + matmul(D, half * force)
-        by_bend = by_bend - matmul(flexibility, half * force)
-    right = node.right[:, None]
-    linear = jnp.concatenate([by_force, rows(right, 3, 6)], axis=1)
-    drive = jnp.concatenate([by_theta, rows(right, 0, 3)], axis=1) - matmul(D, linear)
-    compliance, bending = inverse_block(once(stiff), tuple(i for i in free if i < 3))
-    lever = -w * n  # moment over the cell per linear strain
-    doubled = jnp.concatenate([2.0 * moment, jnp.zeros_like(right[:3])], axis=1)
-    cell = EliminationCell(
-        w,
+def _nodes(H: Matrix, right: Vector, along: Reaction, slopes: Slopes, grid: Grid) -> StepNodes:
+    """The nodes of all steps, in the last axes (stages, steps, *arms)."""
+    everything = (*H[0], *right, grid.weight, *along.world, *along.axis)
+    shape = jnp.broadcast_shapes(*(x.shape for x in everything))
+
+    def whole(x: Array) -> Array:
+        return jnp.broadcast_to(x, (*x.shape[: x.ndim - len(shape)], *shape))
+
+    def block(first: int, second: int) -> Array:
+        entries = [H[first + i][second + j] for i in range(3) for j in range(3)]
+        return jnp.stack([whole(x) for x in entries]).reshape(3, 3, *shape)
+
+    return StepNodes(
+        jnp.broadcast_to(grid.h, shape[1:]),
+        whole(along.rotation),
+        block(0, 0),
+        block(0, 3),
+        block(3, 3),
+        jnp.stack([whole(x) for x in right]),
+        whole(along.axis),
+        whole(along.world),
+        whole(along.density),
+        None if slopes.density is None else whole(slopes.density),
+        _jumps(slopes, grid, shape[2:]),
+    )
+
+
+def _jumps(slopes: Slopes, grid: Grid, arms: tuple[int, ...]) -> Array | None:
+    """Derivatives (6, 3, steps, *arms) of the loads at points, each at the end of the step before
+    it; None without such loads."""
+    total = None
+    for point in slopes.points:
+        step = jnp.arange(grid.h.shape[0]).reshape(-1, *(1,) * point.step.ndim) == point.step - 1
+        here = step.astype(grid.h.dtype) * point.matrix[:, :, None]
+        total = here if total is None else total + here
+    return None if total is None else jnp.broadcast_to(total, (*total.shape[:3], *arms))
+
+
+def _apart(nodes: StepNodes, grid: Grid) -> StepNodes:
+    """Each node as a step of its own, whose length is its weight."""
+    stages, steps = grid.X.shape[:2]
+
+    def own(x: Array, place: int) -> Array:
+        shape = (*x.shape[:place], 1, stages * steps, *x.shape[place + 2 :])
+        return x.swapaxes(place, place + 1).reshape(shape)
+
+    apart = nodes._replace(h=None, jump=None)
+    apart = jax.tree.map(lambda x: own(x, x.ndim - nodes.axis.ndim + 1), apart)
+    jump = nodes.jump
+    if jump is not None:
+        none = jnp.zeros((*jump.shape[:2], stages - 1, *jump.shape[2:]), jump.dtype)
+        jump = own(jnp.concatenate([none, jump[:, :, None]], axis=2), 2)[:, :, 0]
+    h = own(jnp.broadcast_to(grid.weight, nodes.axis.shape[1:]), 0)[0]
+    return apart._replace(h=h, jump=jump)
+
+
+def _moved(tree: Tree, source: int, destination: int) -> Tree:
+    """Arrays with one axis moved."""
+    return jax.tree.map(lambda x: jnp.moveaxis(x, source, destination), tree)
+
+
+def _along_step(weights: np.ndarray, values: Array, axis: int) -> Array:
+    """Weighted sums over an axis of nodes, one per row of weights in its place."""
+    return jnp.moveaxis(weighted(weights, values, axis), 0, axis)
+
+
+def _total(values: Array, axis: int) -> Array:
+    """Sum over an axis of nodes."""
+    return weighted(np.ones(values.shape[axis]), values, axis)
+
+
+def _constant(weights: np.ndarray, like: Array) -> Array:
+    """Constants in front of the axes of an array."""
+    return jnp.asarray(weights, like.dtype).reshape(*weights.shape, *(1,) * like.ndim)
+
+
+def _condensed(node: StepNodes, free: tuple[int, ...]) -> tuple[Sections, Condensed, Array, Array]:
+    """The sections of a step and the step, the number of negative pivots of its system, and whether
+    its sections are stable by themselves."""
+    stages, h, rest = node.axis.shape[1], node.h, remaining(node.axis.shape[1])
+    weights = gauss_legendre(stages)[1]
+    n = skew(rows(node.wrench, 3, 6))
+    sections, stable = _sections(node, n, free)
+    by_end, by_bend = _moments(node, n, sections)
+    compliance, negative = _compliance(sections.compliance, by_bend[:3, :, :stages])
+    X = _total(matmul(compliance, by_end[:3, :, None, :stages]), 3)
+    start, turning = by_end[:, :, stages], by_bend[:, :, stages]
+    start = start + _total(matmul(turning, X), 2)
+    turn = h * weighted(weights, X, 2) + _constant(np.eye(3, X.shape[1]), h)
+    density = -h * _along_step(rest, matvec(sections.pull, sections.force), 1)
+    moment = sections.moment + density[:, :stages]
+    bent = once(_total(matvec(compliance, moment[:, None]), 2))
+    started = _total(matvec(turning, bent), 1)
+    started = jnp.concatenate([rows(started, 0, 3) + density[:, stages], started[3:]])
+    before = h * weighted(collocation(stages)[0], rows(node.density, 0, 3), 1)
+    step = Condensed(
+        X,
         turn,
-        rows(node.wrench, 0, 3),
-        compliance,
-        matmul(compliance, drive),
-        doubled + matmul(lever, matmul(flexibility, linear)),
-        w * moment - matmul(lever, by_bend),
+        start,
+        bent,
+        h * weighted(weights, bent, 1),
+        started,
+        node.jump,
+        node.wrench[:3, 0] + before,
+        sections.compliance[:, :, 0],
     )
-    if follows:
-        cell = cell._replace(
-            by_push=-matmul(compliance, D),
-            stretch=matmul(lever, flexibility),
-            axis=node.axis,
-            force=force,
-            jump=None if node.jump is None else seen_from(R, node.jump),
+    return sections, step, negative, stable
+
+
+def _sections(node: StepNodes, n: Array, free: tuple[int, ...]) -> tuple[Sections, Array]:
+    """The nodes of a step each alone, and whether their sections are stable by themselves."""
+    linear, below = inverse_block(node.linear, tuple(i - 3 for i in free if i > 2))
+    across = matmul(node.mixed, linear)
+    stiff = once(node.bending - matmul(across, transpose(node.mixed)))
+    compliance, negative = inverse_block(stiff, tuple(i for i in free if i < 3))
+    R = node.rotation[:, :, None]
+    three = jnp.stack([compliance, linear, across], axis=2)
+    three = matmul(matmul(R, three), transpose(R))
+    compliance, linear, across = (three[:, :, i] for i in range(3))
+    b = turned(node.rotation, node.right)
+    force = rows(b, 3, 6)
+    moment = rows(b, 0, 3) - matvec(across, force)
+    stable = jnp.all((negative == 0) & (below == 0), axis=0)
+    return Sections(compliance, linear, across, matmul(n, linear), moment, force), stable
+
+
+def _moments(node: StepNodes, n: Array, sections: Sections) -> tuple[Array, Array]:
+    r"""The moment that bends each node, and in the last place the change of the wrench at the start
+    of the step, as maps: of $(\theta_0, \delta m_1, \delta n_1)$, (wrench, columns, places), and
+    of the bending of the nodes, (wrench, 3, places, nodes). Only the last place has a force."""
+    stages, h, D, pull = node.axis.shape[1], node.h, sections.across, sections.pull
+    u, m = skew(node.axis), skew(rows(node.wrench, 0, 3))
+    rest, only = remaining(stages), np.eye(stages + 1, stages)
+    beyond, here = h * _constant(rest, h), _constant(only, h)
+    density = matmul(n, u) - matmul(pull, n)  # of the moment, by the rotation
+    if node.slope is not None:
+        density = density + node.slope[:3]
+    by_theta = beyond * density[:, :, None] + here * (m - matmul(D, n))[:, :, None]
+    by_bend = beyond * matmul(n, transpose(D))[:, :, None]
+    same = jnp.zeros((3, 3, stages + 1, *h.shape), h.dtype) + _constant(
+        np.eye(3), by_theta[0, 0, 0]
+    )
+    by_end = [same]
+    if node.slope is not None or node.jump is not None:
+        by_force = once(beyond * (u - pull)[:, :, None] - here * D[:, :, None])
+        force = jnp.zeros_like(by_theta)
+        if node.slope is not None:
+            force = beyond * node.slope[3:][:, :, None]
+            change = matmul(by_force[:, :, :, :, None], force[:, :, None, :stages])
+            by_theta = by_theta + _total(change, 3)
+        none = jnp.zeros_like(same)
+        by_theta, by_bend = (
+            jnp.concatenate(pair) for pair in ((by_theta, force), (by_bend, jnp.zeros_like(force)))
         )
-    stable = (bending == 0) & (stretching == 0)
-    return cell, EliminatedLinear(flexibility, linear, by_bend), stable
+        by_end = [jnp.concatenate([same, none]), jnp.concatenate([_total(by_force, 3), same])]
+    by_theta = once(by_theta)
+    by_bend = by_bend + h * _along_step(collocation(stages).T, by_theta, 3)
+    return jnp.concatenate([_total(by_theta, 3), *by_end], axis=1), by_bend
 
 
-def _per_rotation(
-    n: Array, u: Array, density: Array | None, half: Array
-) -> tuple[Array, Array, Array | None]:
-    """Derivatives by the rotation of a section, without those through P: of the change of the
-    moment per length, of the force, and of the change of the force over half a cell, which is None
-    without follower density."""
-    if density is None:
-        return matmul(n, u), n, None
-    force = half * density[3:]
-    return matmul(n, u) + matmul(u, force) + density[:3], n + force, force
+def _compliance(C: Array, by_bend: Array) -> tuple[Array, Array]:
+    r"""Solution B (3, 3, i, j) of $B_{ij} = C_i (1_{ij} + \sum_k A_{ik} B_{kj})$, and the number of
+    negative eigenvalues of the pivots.
+
+    The inverse of $1 - C A$ by blocks, in place: one pivot after another, in a loop of the
+    program.
+    """
+    stages, one = C.shape[2], stacked.identity(C[:, :, 0])
+    places = jnp.arange(stages)
+    same = _constant(np.eye(stages), C[0, 0, 0])
+    system = one[:, :, None, None] * same - matmul(C[:, :, :, None], by_bend)
+
+    def eliminate(place: Array, state: tuple) -> tuple:
+        system, negative = state
+        here = (places == place).reshape(-1, *(1,) * negative.ndim)
+        row = lax.dynamic_index_in_dim(system, place, 2, keepdims=False)
+        column = lax.dynamic_index_in_dim(system, place, 3)
+        inverse, below = _inverse_pivot(lax.dynamic_index_in_dim(row, place, 2, keepdims=False))
+        row = matmul(inverse[:, :, None], jnp.where(here, one[:, :, None], row))
+        others = jnp.where(here, 0.0, system) - matmul(column, row[:, :, None])
+        return once(jnp.where(here[:, None], row[:, :, None], others)), negative + below
+
+    negative = jnp.zeros(C.shape[3:], jnp.int32)
+    inverse, negative = lax.fori_loop(0, stages, eliminate, (system, negative))
+    return matmul(inverse, C[:, :, None]), negative
 
 
-def _cell(end: Array, cell: EliminationCell) -> tuple[Array, tuple]:
-    r"""One cell, from its end to its start: the affine change of the wrench at the start, (3, 4) or
-    with follower loads (6, 4); the affine bending $X \theta$ by the rotation at the start, and the
-    number of negative pivots and the asymmetry of the cell."""
-    cell = jax.tree.map(once, cell)  # fused with a use of theirs, slices of the scan are slow
-    P = _seen_from_here(end, cell)
-    width, (mean, whole) = cell.width, _carried(P, cell)
-    Q = matmul(cell.compliance, mean)
-    if cell.by_push is not None and cell.stretch is not None:
-        Q, whole = once(Q + matmul(cell.by_push, P[3:])), whole + matmul(cell.stretch, P[3:])
-    pivot = stacked.identity(Q) - width * columns(Q, 0, 3)
+def _inverse_pivot(pivot: Array) -> tuple[Array, Array]:
+    """Inverse and number of negative eigenvalues of a 3 x 3 matrix with real ones: three minus the
+    sign changes of its characteristic polynomial."""
     adjugate, det = stacked.adjugate(pivot)
-    negative = _negative(stacked.trace(pivot), stacked.trace(adjugate), det)
-    X = matmul(adjugate, Q + cell.by_theta) / det
-    start = whole + cell.moment + matmul(width * columns(whole, 0, 3) + cell.by_bend, X)
-    by_rotation = 0.5 * (columns(P[:3], 0, 3) + columns(start, 0, 3))
-    asymmetry = asymmetry_of(by_rotation, cell.reaction, cell.compliance)
-    if cell.axis is None:
-        return start, (X, None, negative, asymmetry)
-    force, by_bend = P[3:], width * columns(P[3:], 0, 3)
-    if cell.force is not None:
-        by_bend = by_bend + width * cell.force
-        none = jnp.zeros_like(columns(force, 3, 4))
-        force = force + jnp.concatenate([2.0 * cell.force, none], axis=1)
-    return jnp.concatenate([start, force + matmul(by_bend, X)]), (X, P[3:], negative, asymmetry)
-
-
-def _seen_from_here(P: Array, cell: EliminationCell) -> Array:
-    """P at the start of the next cell in the frame of this node, including the load between
-    them."""
-    parts = []
-    for i in range(0, P.shape[0], 3):
-        seen = matmul(cell.turn, rows(P, i, i + 3))
-        by_theta = matmul(columns(seen, 0, 3), transpose(cell.turn))
-        if cell.jump is not None:
-            by_theta = by_theta + rows(cell.jump, i, i + 3)
-        parts.append(jnp.concatenate([by_theta, columns(seen, 3, 4)], axis=1))
-    return parts[0] if len(parts) == 1 else jnp.concatenate(parts)
-
-
-def _carried(P: Array, cell: EliminationCell) -> tuple[Array, Array]:
-    """Change of the moment at the middle and at the start of the cell, including that by the change
-    of the force."""
-    if cell.axis is None:
-        return P, P
-    moment, lever = P[:3], matmul(skew(cell.width * cell.axis), P[3:])
-    return moment + 0.5 * lever, moment + lever
-
-
-def _negative(trace: Array, minors: Array, det: Array) -> Array:
-    """Number of negative eigenvalues of a 3 x 3 matrix with real ones: three minus the sign changes
-    of its characteristic polynomial."""
-    first, second, third = trace > 0, minors > 0, det > 0
+    first, second, third = stacked.trace(pivot) > 0, stacked.trace(adjugate) > 0, det > 0
     changes = (first, first == second, second == third)
-    return 3 - sum(
-        (change.astype(jnp.int32) for change in changes), jnp.zeros(trace.shape, jnp.int32)
+    negative = 3 - sum(
+        (change.astype(jnp.int32) for change in changes), jnp.zeros(det.shape, jnp.int32)
     )
+    return adjugate / det, negative
+
+
+def _joined(end: tuple[Array, Array], step: Condensed) -> tuple[tuple, tuple[Joint, Array, Array]]:
+    """One step, from P and p at its end to those at its start; its `Joint`, the number of negative
+    pivots and the asymmetry."""
+    step = jax.tree.map(once, step)  # fused with a use of theirs, slices of the scan are slow
+    P, p = end
+    if step.jump is not None:
+        P = P + step.jump
+    by_end = columns(step.turn, 3, step.turn.shape[1])
+    inverse, negative = _inverse_pivot(stacked.identity(P) - matmul(by_end, P))
+    turn = matmul(inverse, columns(step.turn, 0, 3))
+    turned_end = once(matvec(inverse, step.turned + matvec(by_end, p)))
+    wrench, pulled = matmul(P, turn), once(matvec(P, turned_end) + p)
+    by_end = columns(step.start, 3, step.start.shape[1])
+    start = columns(step.start, 0, 3) + matmul(by_end, wrench)
+    asymmetry = asymmetry_of(start[:3], step.moment, step.compliance)
+    joint = Joint(turn, turned_end, wrench, pulled)
+    return (start, step.started + matvec(by_end, pulled)), (joint, negative, asymmetry)
+
+
+def _by_start(
+    node: StepNodes, sections: Sections, step: Condensed, joint: Joint
+) -> tuple[Array, Array]:
+    """The strain of the nodes in the world frame by the rotation at the start, (6, 3, nodes), and
+    by the right side alone, (6, nodes)."""
+    stages, h = node.axis.shape[1], node.h
+    by_end = columns(step.bend, 3, step.bend.shape[1])
+    kappa = once(columns(step.bend, 0, 3) + matmul(by_end, joint.wrench[:, :, None]))
+    bent = once(step.bent + matvec(by_end, joint.pulled[:, None]))
+    theta = h * _along_step(collocation(stages), kappa, 2) + _constant(np.eye(3), kappa[0, 0])
+    turns = h * _along_step(collocation(stages), bent, 1)
+    theta, turns = once(theta), once(turns)
+    back, across = transpose(sections.pull), transpose(sections.across)
+    upsilon = -matmul(back, theta) - matmul(across, kappa)
+    force = sections.force
+    if joint.wrench.shape[0] == 6:
+        push, pushed = joint.wrench[3:, :, None], joint.pulled[3:, None]
+        if node.slope is not None:
+            by_turn, rest = node.slope[3:], remaining(stages)[:-1]
+            push = push + h * _along_step(rest, matmul(by_turn, theta), 2)
+            pushed = pushed + h * _along_step(rest, matvec(by_turn, turns), 1)
+        upsilon = upsilon + matmul(sections.flexibility, push)
+        force = force + pushed
+    stretched = matvec(sections.flexibility, force) - matvec(back, turns) - matvec(across, bent)
+    return jnp.concatenate([kappa, upsilon]), jnp.concatenate([bent, stretched])

@@ -7,19 +7,20 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.custom_batching import custom_vmap
 
-_ALIASED = 64
-"""Batch sizes that are multiples of this are padded: their rows would all map to the same few cache
-lines."""
+_TOGETHER = 136
+"""Arms that are solved together, at most: the arrays of one pass then stay in the cache. Rows whose
+length is a multiple of 64 would all map to the same few cache lines."""
 
 
 def side_by_side(solve: Callable) -> Callable:
     """`solve` with a rule for `jax.vmap` that puts the batch into the last axis of every array.
 
     With the batch in the first axis, every array is transposed before and after each pass along the
-    arm, which took most of the time. Padding with eight copies of the last arm costs less than rows
-    whose length is a power of two.
+    arm, which took most of the time. A large batch is cut into equal parts, one solved after
+    another; copies of the last arm fill the last part.
 
     **Arguments:** `solve`: takes pytrees of arrays and returns one. For a batch each array has one
     more axis at its end, of size 1 where it is the same for all arms.
@@ -31,19 +32,27 @@ def side_by_side(solve: Callable) -> Callable:
 
     @batched_solve.def_vmap
     def _(size: int, batched: list, *arguments: Any) -> tuple[Any, Any]:
-        batch_size = size + 8 if size % _ALIASED == 0 else size
-        # copies of the last arm fill the row; an empty batch has none
-        place = jnp.minimum(jnp.arange(batch_size), max(size - 1, 0))
+        parts = -(-size // _TOGETHER) or 1
+        together = -(-size // parts) or 1
+        place = jnp.minimum(jnp.arange(parts * together), max(size - 1, 0))
+        leaves, tree = jax.tree.flatten(arguments)
+        own = jax.tree.leaves(batched)
 
-        def row(x: Any, along: bool) -> Any:
-            if not along:
-                return x[..., None]
+        def part(x: Any) -> Any:
             x = x if size else jnp.zeros((1, *x.shape[1:]), x.dtype)
-            return jnp.moveaxis(x[place], 0, -1)
+            x = jnp.moveaxis(x[place], 0, -1)
+            return jnp.moveaxis(x.reshape(*x.shape[:-1], parts, together), -2, 0)
 
-        result = solve(*jax.tree.map(row, arguments, tuple(batched)))
+        def solved(varying: list) -> Any:
+            given = iter(varying)
+            every = [next(given) if o else x[..., None] for x, o in zip(leaves, own, strict=True)]
+            result = solve(*jax.tree.unflatten(tree, every))
+            return jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], together)), result)
+
+        varying = [part(x) for x, o in zip(leaves, own, strict=True) if o]
+        result = lax.map(solved, varying)
         result = jax.tree.map(
-            lambda x: jnp.moveaxis(jnp.broadcast_to(x, (*x.shape[:-1], batch_size)), -1, 0)[:size],
+            lambda x: jnp.moveaxis(x, -1, 1).reshape(parts * together, *x.shape[1:-1])[:size],
             result,
         )
         return result, jax.tree.map(lambda _: True, result)

@@ -35,6 +35,9 @@ _RAISE, _LOWER = 10.0, 30.0
 _MIN_CONTRACTION, _MAX_CONTRACTION = 0.25, 0.99
 """Contraction of the residual above which a step is extrapolated, and the largest that is used: it
 bounds the extrapolation to 98 steps."""
+_CERTAIN, _NEAR = 0.1, 1e-4
+"""Contraction of steps and residuals, and size of a step, below which the last step is taken
+without an evaluation after it: what it leaves is then known from the contraction."""
 _ACCEPTED = 64
 """Largest accepted residual, in multiples of its rounding level."""
 _MAX_RISES = 3
@@ -192,13 +195,17 @@ def damped_newton(
       last step, made small, and creeps: $s_{n+1} = s_n + (H + \mu \Sigma)^{-1} r(x - s_n)$. The
       solution is unstable if the motion grows after some steps.
 
-    The iteration ends where the residual is accepted, the step is undamped, and either the step
-    times $1 / (1 - \rho)$, the sum of all steps to come, is negligible, or the residual has risen
-    three times, which is rounding. A residual that is not accepted never ends the iteration before
-    its bounds do. A problem that reaches the bound on its evaluations or on $\mu$ gets some plain
-    Newton steps, which find an unstable equilibrium if one is near. The last step is not taken, so
-    that the returned residual is that of the returned point. Several problems can be solved
-    together, in the last axes of all arrays; each stops when it is done.
+    - Last step. Near the solution, where the last step and residual were at most `_CERTAIN` of
+      those before, the next step is taken without another evaluation if what it leaves, by the
+      same ratio, is negligible and accepted.
+
+    The iteration ends with a last step, or where the residual is accepted, the step is undamped,
+    and either the step times $1 / (1 - \rho)$, the sum of all steps to come, is negligible, or the
+    residual has risen three times, which is rounding; that step is not taken. A residual that is
+    not accepted never ends the iteration before its bounds do. A problem that reaches the bound on
+    its evaluations or on $\mu$ gets some plain Newton steps, which find an unstable equilibrium if
+    one is near. Several problems can be solved together, in the last axes of all arrays; each stops
+    when it is done.
 
     **Arguments:**
     - `evaluate`: maps a point, a damping $\mu$ and the fraction of the loads to `Damped`.
@@ -212,7 +219,7 @@ def damped_newton(
     """
     twice = increments > 1 or origin is not None
     origin = start if origin is None else origin
-    small = jnp.finfo(floor.dtype).eps ** 0.75
+    small = float(jnp.finfo(floor.dtype).eps ** 0.75)
     accepted = jnp.maximum(_ACCEPTED * floor, small)
 
     def going(guard: _Guard) -> Array:
@@ -236,14 +243,19 @@ def damped_newton(
         new = evaluate(trial, jnp.where(probe, _PROBE_DAMPING, damping), applied / increments)
         left = measures.work(new.residual, step)
         taken = _accepted(old, new, left, floor, plain, increments)
-        guard, more = _judged(old, new, left, taken, plain, damping, applied, floor, accepted)
+        guard, more, last = _judged(
+            old, new, left, taken, plain, damping, applied, floor, accepted, small
+        )
         more = jnp.where(probe, 1.0, more)
         new_step = jax.tree.map(lambda s, last: s + more.astype(s.dtype) * last, new.step, step)
         pull = jnp.where(taken, measures.work(new.residual, new_step), guard.pull)
         go = going(old)
         ratio = measures.turn(new_step) / measures.turn(step)
         guard = select(go, guard._replace(pull=pull), _probed(old, probe, ratio))
-        x = select(go & taken, trial, x)
+        finished = jax.tree.map(
+            lambda a, s: a - jnp.where(last, s, 0.0).astype(a.dtype), trial, new.step
+        )
+        x = select(go & taken, finished, x)
         if not twice:
             return x, new_step, guard
         failed = jnp.where(go, ~(taken & new.definite), old.definite & ~guard.definite)
@@ -343,9 +355,11 @@ def _judged(
     applied: Array,
     floor: Array,
     accepted: Array,
-) -> tuple[_Guard, Array]:
-    """State after an evaluation, its `pull` still that of the last step, and the fraction of that
-    step by which the next one is extrapolated."""
+    small: float,
+) -> tuple[_Guard, Array, Array]:
+    """State after an evaluation, its `pull` still that of the last step; the fraction of that step
+    by which the next one is extrapolated; and whether the next one is the last, taken without
+    another evaluation."""
     good = taken & (new.definite | plain)
     damping = jnp.where(good, damping, _raised(jnp.where(taken, damping, old.damping)))
     # an undamped step between two residuals under the same loads
@@ -353,11 +367,15 @@ def _judged(
     ratio = new.size / old.size
     more = _extrapolated(whole & (new.merit > 4 * floor), jnp.minimum(left / old.pull, ratio))
     rho = jnp.where(whole, jnp.clip(ratio, 0.0, _MAX_CONTRACTION), 0.0)
+    both = jnp.clip(jnp.maximum(ratio, new.merit / old.merit), 0.0, 1.0)
+    merit, miss = both * new.merit, both / (1 - both) * new.size
+    certain = whole & taken & new.definite & (both < _CERTAIN) & (new.size < _NEAR)
+    last = certain & (merit <= accepted) & (miss < small)
     risen = whole & (old.merit <= accepted) & (new.merit >= old.merit)
     there = old._replace(
         size=new.size,
-        miss=new.size / (1 - rho),
-        merit=new.merit,
+        miss=jnp.where(last, miss, new.size / (1 - rho)),
+        merit=jnp.where(last, merit, new.merit),
         definite=new.definite,
         damping=damping,
         applied=applied,
@@ -369,7 +387,11 @@ def _judged(
     guard = select(taken, there, here)
     # a rejected step is computed again with more damping before it is used; that of a problem that
     # is done is never used
-    return guard._replace(spent=old.spent + 1, plain=old.plain + plain.astype(jnp.int32)), more
+    return (
+        guard._replace(spent=old.spent + 1, plain=old.plain + plain.astype(jnp.int32)),
+        more,
+        last,
+    )
 
 
 def _extrapolated(wanted: Array, left: Array) -> Array:

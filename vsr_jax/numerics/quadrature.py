@@ -89,6 +89,20 @@ def interpolation(stages: int, origin: float = 0.0) -> np.ndarray:
     return np.linalg.inv(np.vander(gauss_legendre(stages)[0] - origin, increasing=True))
 
 
+def collocation(stages: int) -> np.ndarray:
+    """Weights $a_{ij}$ of the integral from the start of a step of length 1 to its node i of the
+    polynomial through values at the nodes: the coefficients of Gauss collocation."""
+    powers = np.arange(1, stages + 1)
+    return (gauss_legendre(stages)[0][:, None] ** powers / powers) @ interpolation(stages)
+
+
+def remaining(stages: int) -> np.ndarray:
+    """Weights of the integrals from each node, and in the last row from the start, to the end of a
+    step of length 1; shape (stages + 1, stages)."""
+    weights = gauss_legendre(stages)[1]
+    return np.vstack([weights - collocation(stages), weights])
+
+
 def merging(stages: int) -> np.ndarray:
     """Weights of the interpolation from the Gauss nodes of two equal steps, first those of the
     first step, to the nodes of the merged step, by the polynomial through all of them; shape
@@ -115,13 +129,7 @@ def beyond(density: Array, grid: Grid) -> Array:
 
     **Arguments:** `density`: components $q$ at the nodes, shape (components, stages, steps, *arms).
     """
-    stages = grid.X.shape[0]
-    nodes, weights = gauss_legendre(stages)
-    powers = np.arange(1, stages + 1)
-    # of the integral over a step of length 1
-    rest = weights - (nodes[:, None] ** powers / powers) @ interpolation(stages)
-    # the last row is the whole step
-    sums = weighted(np.vstack([rest, weights]), grid.h * density, axis=1)
+    sums = weighted(remaining(grid.X.shape[0]), grid.h * density, axis=1)
     whole = jnp.moveaxis(sums[-1], 1, 0)
     none = jnp.zeros_like(whole[0])
     _, later = lax.scan(lambda total, part: (total + part, total), none, whole, reverse=True)
