@@ -52,10 +52,10 @@ def solve(
       error.
     - `start`: an equilibrium near by, of any model and of a scene with the same kinds of actuators,
       from which Newton's method of a loaded `StrainDependent` starts; the other models and arms
-      without loads have no use for it. A small change of a soft arm then takes a third to a
-      fifth of the steps. Where it does not lead straight to a stable equilibrium, the solve starts
-      again as without it; of several stable equilibria the result is the one near `start`. No derivative is
-      taken with respect to it.
+      without loads have no use for it. A small change of a soft arm then takes a third to a fifth
+      of the steps. Where it does not lead straight to a stable equilibrium, the solve starts again
+      as without it; of several stable equilibria the result is the one near `start`. No derivative
+      is taken with respect to it.
     - `throw`: raise if the solve did not converge. Otherwise `status` gives the reason and the
       shape is NaN.
 
