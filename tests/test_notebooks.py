@@ -37,10 +37,19 @@ def test_outputs_are_stripped(path):
 
 
 def code_of(path):
-    """Syntax tree of all code cells, without the commands of the notebook."""
-    cells = [cell for cell in read(path)["cells"] if cell["cell_type"] == "code"]
-    lines = [line for cell in cells for line in text_of(cell).splitlines()]
-    return ast.parse("\n".join(line for line in lines if not line.lstrip().startswith(("%", "!"))))
+    """Syntax tree of each code cell, without the commands of the notebook."""
+    trees = []
+    for cell in read(path)["cells"]:
+        if cell["cell_type"] == "code":
+            lines = text_of(cell).splitlines()
+            code = "\n".join(line for line in lines if not line.lstrip().startswith(("%", "!")))
+            trees.append(ast.parse(code))
+    return trees
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_code_compiles(path):
+    assert code_of(path)
 
 
 def dotted(node):
@@ -54,7 +63,7 @@ def dotted(node):
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_every_name_of_the_package_exists(path):
-    nodes, imported = list(ast.walk(code_of(path))), {}
+    nodes, imported = [node for tree in code_of(path) for node in ast.walk(tree)], {}
     for node in nodes:
         if isinstance(node, ast.Import | ast.ImportFrom) and "vsr_jax" in ast.unparse(node):
             exec(compile(ast.Module([node], []), path.name, "exec"), imported)

@@ -42,8 +42,10 @@ from .elimination_nodes import (
     UNSTABLE_SECTION,
     Definiteness,
     asymmetry_of,
+    at_last_nodes,
     definiteness,
     inverse_block,
+    jumps,
 )
 from .reaction import Reaction, Slopes
 
@@ -191,6 +193,8 @@ def _nodes(H: Matrix, right: Vector, along: Reaction, slopes: Slopes, grid: Grid
     def whole(x: Array) -> Array:
         return jnp.broadcast_to(x, (*x.shape[: x.ndim - len(shape)], *shape))
 
+    jump = jumps(slopes, grid)
+
     def block(first: int, second: int) -> Array:
         entries = [H[first + i][second + j] for i in range(3) for j in range(3)]
         return jnp.stack([whole(x) for x in entries]).reshape(3, 3, *shape)
@@ -206,19 +210,8 @@ def _nodes(H: Matrix, right: Vector, along: Reaction, slopes: Slopes, grid: Grid
         whole(along.world),
         whole(along.density),
         None if slopes.density is None else whole(slopes.density),
-        _jumps(slopes, grid, shape[2:]),
+        None if jump is None else jnp.broadcast_to(jump, (*jump.shape[:2], *shape[1:])),
     )
-
-
-def _jumps(slopes: Slopes, grid: Grid, arms: tuple[int, ...]) -> Array | None:
-    """Derivatives (6, 3, steps, *arms) of the loads at points, each at the end of the step before
-    it; None without such loads."""
-    total = None
-    for point in slopes.points:
-        step = jnp.arange(grid.h.shape[0]).reshape(-1, *(1,) * point.step.ndim) == point.step - 1
-        here = step.astype(grid.h.dtype) * point.matrix[:, :, None]
-        total = here if total is None else total + here
-    return None if total is None else jnp.broadcast_to(total, (*total.shape[:3], *arms))
 
 
 def _apart(nodes: StepNodes, grid: Grid) -> StepNodes:
@@ -233,8 +226,7 @@ def _apart(nodes: StepNodes, grid: Grid) -> StepNodes:
     apart = jax.tree.map(lambda x: own(x, x.ndim - nodes.axis.ndim + 1), apart)
     jump = nodes.jump
     if jump is not None:
-        none = jnp.zeros((*jump.shape[:2], stages - 1, *jump.shape[2:]), jump.dtype)
-        jump = own(jnp.concatenate([none, jump[:, :, None]], axis=2), 2)[:, :, 0]
+        jump = own(at_last_nodes(jump, stages), 2)[:, :, 0]
     h = own(jnp.broadcast_to(grid.weight, nodes.axis.shape[1:]), 0)[0]
     return apart._replace(h=h, jump=jump)
 

@@ -71,7 +71,9 @@ def nodes_of(
         """Of an array (components, stages, steps, *arms)."""
         return jnp.moveaxis(x, (2, 1), (0, 1)).reshape(-1, *shape, *x.shape[3:])
 
-    density, jump, rotation = slopes.density, _jumps(slopes, grid), along.rotation
+    density, jump, rotation = slopes.density, jumps(slopes, grid), along.rotation
+    if jump is not None:
+        jump = at_last_nodes(jump, grid.X.shape[0])
 
     def slope(x: Array | None) -> Array | None:
         """Of a matrix (6, motion, stages, steps, *arms)."""
@@ -141,17 +143,21 @@ def turns(R: Array) -> Array:
     return jnp.concatenate([relative, last[None]])
 
 
-def _jumps(slopes: Slopes, grid: Grid) -> Array | None:
-    """Derivatives (6, motion, stages, steps) of the loads at points, each at the last node before
-    it."""
+def jumps(slopes: Slopes, grid: Grid) -> Array | None:
+    """Derivatives (6, motion, steps, ...) of the loads at points, each at the end of the step
+    before it; None without such loads."""
     total = None
     for point in slopes.points:
         step = jnp.arange(grid.h.shape[0]).reshape(-1, *(1,) * point.step.ndim) == point.step - 1
-        place = jnp.zeros((grid.X.shape[0], *step.shape), grid.h.dtype)
-        place = place.at[-1].set(step.astype(grid.h.dtype))
-        here = place * point.matrix[:, :, None, None]
+        here = step.astype(grid.h.dtype) * point.matrix[:, :, None]
         total = here if total is None else total + here
     return total
+
+
+def at_last_nodes(jump: Array, stages: int) -> Array:
+    """Matrices at the ends of steps (n, m, steps, ...) as those of nodes (n, m, stages, steps,
+    ...), of the last of each step."""
+    return jnp.pad(jump[:, :, None], [(0, 0), (0, 0), (stages - 1, 0), *[(0, 0)] * (jump.ndim - 2)])
 
 
 def asymmetry_of(by_rotation: Array, moment: Array, compliance: Array) -> Array:

@@ -11,8 +11,11 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 
 _TOGETHER = 136
-"""Arms that are solved together, at most: the arrays of one pass then stay in the cache. Rows whose
-length is a multiple of 64 would all map to the same few cache lines."""
+"""Arms that are solved together, at most: the arrays of one pass then stay in the cache."""
+
+_ALIASED = 64
+"""Numbers of arms that are multiples of this are raised by eight: their rows would all map to the
+same few cache lines."""
 
 
 def side_by_side(solve: Callable) -> Callable:
@@ -20,7 +23,8 @@ def side_by_side(solve: Callable) -> Callable:
 
     With the batch in the first axis, every array is transposed before and after each pass along the
     arm, which took most of the time. A large batch is cut into equal parts, one solved after
-    another; copies of the last arm fill the last part.
+    another. Copies of the last arm fill the last part: eight of them cost less than rows whose
+    length is a power of two.
 
     **Arguments:** `solve`: takes pytrees of arrays and returns one. For a batch each array has one
     more axis at its end, of size 1 where it is the same for all arms.
@@ -34,6 +38,7 @@ def side_by_side(solve: Callable) -> Callable:
     def _(size: int, batched: list, *arguments: Any) -> tuple[Any, Any]:
         parts = -(-size // _TOGETHER) or 1
         together = -(-size // parts) or 1
+        together += 8 if together % _ALIASED == 0 else 0
         place = jnp.minimum(jnp.arange(parts * together), max(size - 1, 0))
         leaves, tree = jax.tree.flatten(arguments)
         own = jax.tree.leaves(batched)
