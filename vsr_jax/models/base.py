@@ -62,6 +62,8 @@ _NOTHING = 1e-4
 _UNSETTLED = 4
 """Factor by which the ratio of the errors of steps and of steps twice as long may differ from that
 of their order, since a few steps are not yet in the asymptotic regime."""
+_MANY = 8
+"""Steps from which half as many are close enough to that regime under loads."""
 
 
 class Nodes(NamedTuple):
@@ -167,8 +169,8 @@ class Model(eqx.Module):
         return unnamed(size)
 
     def refined(self, scene: Scene, inputs: Array, forces: Forces, state: Any) -> Refinement:
-        """A better solution than the given one, from which its error is estimated; by default the
-        solution of the `finer` model."""
+        """Another solution, from which the error of the given one is estimated; by default that of
+        the `finer` model."""
         grid, finer = make_grid(scene.edges(), 32, 3), self.finer()
         found, X = finer.solve(scene, inputs), grid.X.reshape(-1)
         return Refinement(
@@ -176,7 +178,6 @@ class Model(eqx.Module):
             X,
             self.strain(scene, forces, state, X),
             finer.strain(scene, found.forces, found.state, X),
-            1.0,
         )
 
     def step_error(self, scene: Scene, forces: Forces, state: Any) -> Scalar | None:
@@ -217,20 +218,44 @@ class SteppedModel(Model):
         """Strain at the nodes of `grid`, six component arrays of shape (stages, steps)."""
 
     def refined(self, scene: Scene, inputs: Array, forces: Forces, state: Any) -> Refinement:
-        smooth = not scene.coupled and scene.edges().size == 2
-        if self.balanced_everywhere and smooth and self.steps > 1:
-            grid, xi = self.grid(scene), self.node_strain(scene, state)
-            error = (self.steps / (self.steps // 2 * 2)) / (2**self.order - 1)
-            tip = merged_tip(xi, grid, scene.rod.base)
-            return Refinement(tip, grid.X, xi, xi, _UNSETTLED * error)
+        if self.balanced_everywhere and scene.edges().size == 2 and self.steps > 1:
+            if not scene.coupled:
+                return self._merged(scene, state)
+            if self.steps >= _MANY:
+                return self._coarser(scene, inputs, forces, state)
         grid = make_grid(scene.edges(self.breakpoints(scene)), 2 * self.steps, 3)
-        xi = better = self.strain_on(scene, forces, state, grid)
+        given, other = self._corrected(scene, inputs, forces, state, grid)
+        return Refinement(tip_pose(other, grid.h, scene.rod.base), grid.X, given, other)
+
+    def _merged(self, scene: Scene, state: Any) -> Refinement:
+        """By pairs of steps."""
+        grid, xi = self.grid(scene), self.node_strain(scene, state)
+        error = (self.steps / (self.steps // 2 * 2)) / (2**self.order - 1)
+        return Refinement(merged_tip(xi, grid, scene.rod.base), grid.X, xi, xi, _UNSETTLED * error)
+
+    def _coarser(self, scene: Scene, inputs: Array, forces: Forces, state: Any) -> Refinement:
+        """By half as many steps, with the orders that the errors of the tip and, as a polynomial
+        through the nodes of a step, of the strain have."""
+        steps = self.steps // 2
+        grid = make_grid(scene.edges(), steps, self.order // 2)
+        given, other = self._corrected(scene, inputs, forces, state, grid)
+        tip, strain = (
+            _UNSETTLED / ((self.steps / steps) ** order - 1)
+            for order in (self.order, self.order // 2 + 1)
+        )
+        return Refinement(
+            tip_pose(other, grid.h, scene.rod.base), grid.X, given, other, tip, strain
+        )
+
+    def _corrected(
+        self, scene: Scene, inputs: Array, forces: Forces, state: Any, grid: Grid
+    ) -> tuple[Vector, Vector]:
+        """The strain on a grid, and that corrected there."""
+        xi = self.strain_on(scene, forces, state, grid)
         if scene.coupled:
             turning = self.turning(scene, state, grid)
-            better = corrected_strain(scene, inputs, forces, xi, turning, grid)
-        elif not self.balanced_everywhere:
-            better = balanced_strain(scene, forces, xi, grid)
-        return Refinement(tip_pose(better, grid.h, scene.rod.base), grid.X, xi, better, 1.0)
+            return xi, corrected_strain(scene, inputs, forces, xi, turning, grid)
+        return xi, xi if self.balanced_everywhere else balanced_strain(scene, forces, xi, grid)
 
     def poses(
         self, scene: Scene, forces: Forces, state: Any, X: Float[Array, " stations"]

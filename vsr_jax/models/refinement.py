@@ -1,19 +1,18 @@
-r"""Better solutions than a given one, against which its error is estimated.
+r"""Another solution beside a given one, against which its error is estimated.
 
-- Without loads, on an arm that is one smooth piece, a model with balanced sections has no error but
-  that of its steps. Pairs of steps are merged into one, with the strain at the new nodes
-  interpolated by the polynomial through the old ones: no balance is solved, and the tip moves by
-  $2^p - 1$ times its error for steps of order p.
+- On an arm that is one smooth piece, a model with balanced sections has no error but that of its
+  steps of order p, and steps twice as long have $2^p$ times that error. Without loads, pairs of
+  steps are merged into one, with the strain at the new nodes interpolated by the polynomial through
+  the old ones: no balance is solved. With loads, lengths or friction, the strain is corrected on
+  half as many steps by one Newton step of the whole arm, which leaves far less than the difference.
 - Otherwise a finer solution starts from the given one, which saves a full solve. Without loads its
   cross-sections are balanced at twice as many steps of order 6. With loads, lengths or friction the
-  strain there is corrected by Newton steps of the whole arm with the approximate tangent, which
-  leave a tenth of the error or less.
+  strain there is corrected by one Newton step.
 """
 
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array
 
 from ..arm.scene import Scene
@@ -26,20 +25,21 @@ from ..numerics.magnus import tip_pose
 from ..numerics.quadrature import Grid, merging
 from ..typing import Pose, cast
 
-CORRECTIONS = 3
-"""Newton steps that correct the strain on a finer grid: each gains one to two digits, and the
-strain that they begin with has about four."""
-
 
 class Refinement(NamedTuple):
-    """A solution beside the given one: the pose of its tip, the strain of both at the abscissas X
-    [m] (of any shape), and by what the distance of the tips is multiplied to bound the error."""
+    """A solution beside the given one.
+
+    **Fields:** the pose of its tip; the strain of the given and of the other one at abscissas X [m]
+    (of any shape); by what the distance of the tips and that of the strains are multiplied to bound
+    the errors of the given one.
+    """
 
     tip: Pose
     X: Array
     given: Vector
-    better: Vector
-    factor: float
+    other: Vector
+    tip_factor: float = 1.0
+    strain_factor: float = 1.0
 
 
 def merged_tip(xi: Vector, grid: Grid, base: Pose | None) -> Pose:
@@ -66,15 +66,11 @@ def balanced_strain(scene: Scene, forces: Forces, xi: Vector, grid: Grid) -> Vec
 def corrected_strain(
     scene: Scene, inputs: Array, forces: Forces, xi: Vector, turning: Vector, grid: Grid
 ) -> Vector:
-    """Strain of a coupled arm on a grid, corrected from xi and the turning rates there."""
+    """Strain of a coupled arm on a grid, corrected by a Newton step from the strain xi and the
+    turning rates there."""
     problem, kind = problem_of(scene, inputs, grid)
-
-    def correct(_: Array, unknown: ArmUnknown) -> ArmUnknown:
-        at = state_of(unknown, problem, kind)
-        step, _, _ = approximate_solve(
-            unknown, at, imbalance_of(unknown, at, problem, kind), problem, kind
-        )
-        return c.subtract(unknown, cast(step, xi[0].dtype))
-
-    start = ArmUnknown(xi, tuple(-forces[place] for place in kind.cables), turning)
-    return lax.fori_loop(0, CORRECTIONS, correct, start).xi
+    unknown = ArmUnknown(xi, tuple(-forces[place] for place in kind.cables), turning)
+    at = state_of(unknown, problem, kind)
+    imbalance = imbalance_of(unknown, at, problem, kind)
+    step, _, _ = approximate_solve(unknown, at, imbalance, problem, kind)
+    return c.subtract(unknown, cast(step, xi[0].dtype)).xi

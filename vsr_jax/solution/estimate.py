@@ -1,4 +1,4 @@
-"""Discretisation error of a solution: its tip and its strain are compared with those of a better
+"""Discretisation error of a solution: its tip and its strain are compared with those of another
 one, see `Model.refined`."""
 
 from typing import Any, NamedTuple
@@ -14,8 +14,8 @@ from ..numerics.component import Vector
 from ..typing import Scalar
 
 _SAFETY = 1.5
-"""Safety factor on the estimated differences: the better solution is itself off by up to a third
-where steps are few."""
+"""Safety factor on the estimated differences: a finer solution is itself off by up to a third where
+steps are few."""
 
 _ROUNDED = 8
 """Bound on rounding, in units of machine epsilon: products of rotations along an arm lose a few."""
@@ -33,18 +33,18 @@ class Error(NamedTuple):
 
 
 def error_of(model: Model, scene: Scene, inputs: Array, forces: Vector, state: Any) -> Error:
-    """Estimated errors of a solution: 1.5 times its estimated difference from a finer one, plus a
-    bound on rounding.
+    """Estimated errors of a solution: 1.5 times the error that its difference from another one
+    shows, plus a bound on rounding.
 
     **Arguments:** as `Model.tip`, and `inputs`, those of the solve.
     """
     scene, inputs, forces, state = lax.stop_gradient((scene, inputs, forces, state))
     found = model.refined(scene, inputs, forces, state)
     distance = (found.tip - model.tip(scene, forces, state))[:3, 3]
-    moved = found.factor * c.norm(c.split(distance))
-    pairs = zip(found.given, found.better, strict=True)
-    change = jnp.stack([jnp.max(jnp.abs(a - b)) for a, b in pairs])
-    size = jnp.stack([jnp.max(jnp.abs(x)) for x in found.better])
+    moved = found.tip_factor * c.norm(c.split(distance))
+    pairs = zip(found.given, found.other, strict=True)
+    change = found.strain_factor * jnp.stack([jnp.max(jnp.abs(a - b)) for a, b in pairs])
+    size = jnp.stack([jnp.max(jnp.abs(x)) for x in found.other])
     least = _ROUNDED * jnp.finfo(moved.dtype).eps
     sections = scene.sections(found.X)
     slender = scene.rod.length * jnp.sqrt(
