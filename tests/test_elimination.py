@@ -31,7 +31,7 @@ def error(loads, order):
     """Relative error of a smooth change of strain that is found again from the exact change of the
     residual along it."""
     scene, model = vsr.Scene(ROD, [TENDON], loads), vsr.StrainDependent(16, order)
-    problem, kind = problem_of(scene, jnp.array([5.0]), model.grid(scene))
+    free, problem = scene.free, problem_of(scene, jnp.array([5.0]), model.grid(scene))
     x, rng = problem.grid.X / LENGTH, np.random.default_rng(0)
     sizes = np.array([2.0, 4.0, 4.0, 0.01, 0.01, 0.01])
     change = tuple(
@@ -46,13 +46,11 @@ def error(loads, order):
     )
 
     def wrench(xi):
-        unknown = ArmUnknown(xi, (), ())
-        return imbalance_of(unknown, state_of(unknown, problem, kind), problem, kind).wrench
+        return imbalance_of(ArmUnknown(xi, ()), state_of(xi, (), problem), problem, free).wrench
 
     _, right = jax.jvp(wrench, (xi,), (change,))
-    unknown = ArmUnknown(xi, (), ())
-    at = state_of(unknown, problem, kind)
-    found, _, _ = approximate_solve(unknown, at, ArmImbalance(right, (), ()), problem, kind)
+    at = state_of(xi, (), problem)
+    found, _, _ = approximate_solve(ArmUnknown(xi, ()), at, ArmImbalance(right, ()), problem, free)
     off, size = (
         sum(jnp.sum(y**2) for y in part)
         for part in (

@@ -19,22 +19,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.flatten_util import ravel_pytree
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..arm.scene import Scene
-from ..mechanics.arm_balance import (
-    ArmProblem,
-    ArmUnknown,
-    Kind,
-    imbalance_of,
-    problem_of,
-    state_of,
-    with_tensions,
-)
+from ..mechanics.arm_balance import ArmSolution, ArmUnknown, imbalance_of, problem_of, state_of
 from ..mechanics.balance import free_components, spread, with_locked
+from ..mechanics.coupling import ArmProblem, forces_at
 from ..models.base import Outcome, Status, resolved
 from ..models.strain_dependent import StrainDependent
+from ..numerics.quadrature import Grid
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import admitted_status, solve
 from ..typing import Scalar, cast
@@ -149,27 +144,27 @@ class _System(NamedTuple):
     model: StrainDependent
     scale: Array
 
-    def problem(self, s: Array) -> tuple[ArmProblem, Kind]:
+    def problem(self, s: Array) -> tuple[ArmProblem, tuple[int, ...]]:
+        """The balance at s, and its free strains."""
         scene, inputs = _at(self.scene, self.path, s)
-        return problem_of(scene, inputs, self.model.grid(scene))
+        return problem_of(scene, inputs, self.model.grid(scene)), scene.free
 
-    def unknown(self, u: Array, problem: ArmProblem, kind: Kind) -> ArmUnknown:
+    def unknown(self, u: Array, problem: ArmProblem, free: tuple[int, ...]) -> ArmUnknown:
         """The unknowns as a structure; locked strains have their rest value."""
-        shape, size = problem.grid.X.shape, problem.grid.X.size
-        values = u[:-1] / self.scale
-        strain = values[: len(kind.free) * size].reshape(-1, *shape)
-        xi = with_locked(spread(tuple(strain), kind.free), problem.sections.rest, kind.free)
-        rest = values[strain.size :]
-        tension, turning = rest[: len(kind.cables)], rest[len(kind.cables) :].reshape(-1, *shape)
-        return ArmUnknown(xi, tuple(tension), tuple(turning))
+        coupled = tuple(one.guess(problem.forces, problem.grid) for one in problem.couplings)
+        like = ArmUnknown(free_components(problem.sections.rest, free), coupled)
+        found = ravel_pytree(_at_nodes(like, problem.grid))[1](u[:-1] / self.scale)
+        xi = with_locked(spread(found.xi, free), problem.sections.rest, free)
+        return found._replace(xi=xi)
 
     def residual(self, u: Array) -> Array:
         """Gradient of a dimensionless energy with respect to the unknowns in `u`."""
-        problem, kind = self.problem(u[-1])
-        unknown = self.unknown(u, problem, kind)
-        rows = imbalance_of(unknown, state_of(unknown, problem, kind), problem, kind)
+        problem, free = self.problem(u[-1])
+        unknown = self.unknown(u, problem, free)
+        at = state_of(unknown.xi, unknown.coupled, problem)
+        rows = imbalance_of(unknown, at, problem, free)
         wrench = tuple(problem.grid.weight * r for r in rows.wrench)
-        flat = jnp.concatenate([jnp.ravel(x) for x in (*wrench, *rows.cable, *rows.turning)])
+        flat, _ = ravel_pytree(rows._replace(wrench=wrench))
         bending = jnp.sum(problem.grid.weight * problem.sections.stiffness[1])
         return flat / self.scale * jnp.sum(problem.grid.h) ** 2 / bending
 
@@ -178,22 +173,23 @@ def _system(scene: SceneOrPath, path: InputPath, start: Equilibrium) -> tuple[_S
     """The system, and its vector at the start of the path."""
     model = start.model
     assert isinstance(model, StrainDependent)
-    problem, kind = problem_of(start.scene, start.inputs, model.grid(start.scene))
-    length, share = jnp.sum(problem.grid.h), jnp.sqrt(problem.grid.weight / jnp.sum(problem.grid.h))
-    axial = jnp.sum(problem.grid.weight * problem.sections.stiffness[3]) / length
-    tension = tuple(-start.sound_forces[place] for place in kind.cables)
-    turning = start.state.turning
-    parts = [
-        (x, share * length if i < 3 else share)
-        for i, x in zip(kind.free, free_components(start.state.xi, kind.free), strict=True)
-    ]
-    parts += [(x, 1 / axial) for x in tension] + [(x, share * length) for x in turning]
-    values, scale = (
-        jnp.concatenate([jnp.ravel(x) for x in column]) for column in zip(*parts, strict=True)
+    free, problem = start.scene.free, problem_of(start.scene, start.inputs, model.grid(start.scene))
+    length, share = problem.length, jnp.sqrt(problem.grid.weight / problem.length)
+    unknown = ArmUnknown(free_components(start.state.xi, free), start.state.coupled)
+    scale = ArmUnknown(
+        tuple(share * length if i < 3 else share for i in free),
+        tuple(coupling.radians(problem) for coupling in problem.couplings),
     )
+    values, scale = (ravel_pytree(_at_nodes(x, problem.grid))[0] for x in (unknown, scale))
     return _System(scene, path, model, lax.stop_gradient(scale)), lax.stop_gradient(
         jnp.append(values * scale, 0.0)
     )
+
+
+def _at_nodes(unknown: ArmUnknown, grid: Grid) -> ArmUnknown:
+    """The same with all strains as arrays over the nodes."""
+    xi = tuple(jnp.broadcast_to(x, grid.X.shape) for x in unknown.xi)
+    return unknown._replace(xi=xi)
 
 
 @eqx.filter_jit
@@ -314,12 +310,11 @@ def _equilibrium(system: _System, u: Array, status: Array, steps: Array) -> Equi
         lambda y: system.residual(jnp.append(y, s)), u[:-1], lambda _, guess: guess, solved
     )
     scene, inputs = _at(system.scene, system.path, s)
-    problem, kind = system.problem(s)
-    unknown = system.unknown(jnp.append(y, s), problem, kind)
-    forces = with_tensions(problem.forces, unknown.tension, kind)
-    outcome = resolved(
-        system.model, scene, Outcome(unknown._replace(tension=()), forces, status, steps)
-    )
+    problem, free = system.problem(s)
+    unknown = system.unknown(jnp.append(y, s), problem, free)
+    forces = forces_at(problem.couplings, unknown.coupled, problem.forces)
+    state = ArmSolution(*unknown, problem.couplings)
+    outcome = resolved(system.model, scene, Outcome(state, forces, status, steps))
     allowed = admitted_status(outcome.status, scene, inputs)
     found = outcome.status == Status.CONVERGED
     outcome = outcome._replace(status=jnp.where(found, allowed, outcome.status))

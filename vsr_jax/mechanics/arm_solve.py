@@ -9,46 +9,33 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from ..arm.scene import CrossSections
 from ..numerics import component as c
 from ..numerics.batching import arms_in, side_by_side
 from ..numerics.component import Vector
 from ..numerics.implicit import implicit_root
 from ..numerics.newton import LOAD_INCREMENTS, MAX_TURN, Damped, Measures, Root, damped_newton
-from ..numerics.quadrature import Grid
 from ..typing import cast
-from .arm_balance import (
-    ArmImbalance,
-    ArmProblem,
-    ArmState,
-    ArmUnknown,
-    Kind,
-    imbalance_of,
-    pull_of,
-    rounding_of,
-    shape_of,
-    shape_size,
-    state_of,
-    with_tensions,
-)
+from .arm_balance import ArmImbalance, ArmUnknown, imbalance_of, rounding_of, state_of
 from .arm_tangent import approximate_solve, tangent_solve
 from .balance import (
     completed,
     free_components,
-    largest_force_scale,
     residual,
     spread,
     strain_norm,
     with_locked,
+    without_force,
 )
+from .coupling import ArmProblem, ArmState, forces_at
+from .sizes import shape_of, shape_size
 
 _START_STEPS = 4
 """Fixed-point steps to the start: each gains a factor of the strains that threads cause."""
 
 
-def solve_arm(problem: ArmProblem, kind: Kind, guess: ArmUnknown | None = None) -> Root:
+def solve_arm(problem: ArmProblem, free: tuple[int, ...], guess: ArmUnknown | None = None) -> Root:
     """Equilibrium of the arm; its point is an `ArmUnknown`. Newton's method starts from a guess, if
-    one is given, else or where that fails from the balance without loads and with slack cables.
+    one is given, else or where that fails from the balance without loads and couplings.
 
     Derivatives are implicit, of any order, in forward and reverse mode: the exact tangent system is
     solved by iterative refinement of `approximate_solve`.
@@ -56,45 +43,46 @@ def solve_arm(problem: ArmProblem, kind: Kind, guess: ArmUnknown | None = None) 
 
     def find(problem: ArmProblem, guess: ArmUnknown | None) -> Root:
         if guess is not None:  # the iteration does not change the locked strains
-            guess = guess._replace(xi=with_locked(guess.xi, problem.sections.rest, kind.free))
-        root = side_by_side(partial(_solve, kind))(_start(problem, kind), guess, problem)
-        return root._replace(x=root.x._replace(xi=free_components(root.x.xi, kind.free)))
+            guess = guess._replace(xi=with_locked(guess.xi, problem.sections.rest, free))
+        root = side_by_side(partial(_solve, free))(_start(problem, free), guess, problem)
+        return root._replace(x=root.x._replace(xi=free_components(root.x.xi, free)))
 
     def whole(x: ArmUnknown, problem: ArmProblem) -> ArmUnknown:
-        return x._replace(xi=completed(x.xi, problem.sections.rest, kind.free))
+        return x._replace(xi=completed(x.xi, problem.sections.rest, free))
 
     def imbalance(x: ArmUnknown, problem: ArmProblem, _: ArmUnknown | None) -> ArmImbalance:
         unknown = whole(x, problem)
-        return imbalance_of(unknown, state_of(unknown, problem, kind), problem, kind)
+        return imbalance_of(unknown, state_of(unknown.xi, unknown.coupled, problem), problem, free)
 
     def linear_solve(
         x: ArmUnknown, problem: ArmProblem, guess: ArmUnknown | None, right: ArmImbalance
     ) -> ArmUnknown:
         _, apply = jax.linearize(lambda x: imbalance(x, problem, guess), x)
-        return tangent_solve(apply, whole(x, problem), problem, right, kind)
+        return tangent_solve(apply, whole(x, problem), problem, right, free)
 
     def at_rest(x: ArmUnknown, problem: ArmProblem, guess: ArmUnknown | None) -> tuple:
         zero = jax.tree.map(jnp.zeros_like, x)
-        rest = free_components(problem.sections.rest, kind.free)
+        rest = free_components(problem.sections.rest, free)
         return zero._replace(xi=rest), problem.at_rest(), guess
 
     root = implicit_root(find, imbalance, linear_solve, at_rest, problem, guess)
     return root._replace(x=whole(root.x, problem))
 
 
-def _start(problem: ArmProblem, kind: Kind) -> ArmUnknown:
-    r"""Nearly the balance of each section alone, without loads and friction and with slack cables:
-    some fixed-point steps $\xi = \Sigma^{-1} B_\tau(\xi) \tau + \xi^*$, in single precision. The
-    rest strain where they do not halve the residual, on average."""
-    tension = (jnp.zeros_like(problem.grid.h[0]),) * len(kind.cables)
-    tau = problem.sections.carry(with_tensions(problem.forces, tension, kind))
+def _start(problem: ArmProblem, free: tuple[int, ...]) -> ArmUnknown:
+    r"""Nearly the balance of each section alone, without loads and with couplings that exert no
+    force: some fixed-point steps $\xi = \Sigma^{-1} B_\tau(\xi) \tau + \xi^*$, in single precision.
+    The rest strain where they do not halve the residual, on average."""
+    none = without_force(problem.forces)
+    coupled = tuple(coupling.guess(none, problem.grid) for coupling in problem.couplings)
+    tau = problem.sections.carry(forces_at(problem.couplings, coupled, problem.forces))
     sections, tau = c.single((problem.sections, tau))
     shape = problem.grid.X.shape
     rest = tuple(jnp.broadcast_to(x, shape) for x in sections.rest)
 
     def closer(i: Array, state: tuple) -> tuple:
         xi, first, _ = state
-        off = spread(free_components(residual(xi, sections, tau), kind.free), kind.free)
+        off = spread(free_components(residual(xi, sections, tau), free), free)
         size = jnp.max(strain_norm(off, sections.stiffness))
         step = tuple(r / s for r, s in zip(off, sections.stiffness, strict=True))
         return c.subtract(xi, step), jnp.where(i == 0, size, first), size
@@ -106,69 +94,49 @@ def _start(problem: ArmProblem, kind: Kind) -> ArmUnknown:
         jnp.where(near, x, x0).astype(exact.dtype)
         for x, x0, exact in zip(xi, rest, problem.sections.rest, strict=True)
     )
-    return ArmUnknown(
-        with_locked(xi, problem.sections.rest, kind.free),
-        tension,
-        (jnp.zeros_like(problem.grid.X),) * len(kind.frictional),
-    )
+    return ArmUnknown(with_locked(xi, problem.sections.rest, free), coupled)
 
 
 class _Sizes(NamedTuple):
     """Dimensionless sizes of steps and residuals, one entry per arm of a batch (see
     `shape_size`)."""
 
-    grid: Grid
-    sections: CrossSections
-    kind: Kind
+    problem: ArmProblem
+    free: tuple[int, ...]
     arms: tuple[int, ...]
 
-    @property
-    def length(self) -> Array:
-        return jnp.sum(self.grid.h, axis=0)
-
     def of_step(self, step: ArmUnknown, at: ArmState) -> Array:
-        """Largest change of the shape, plus that by tensions and by friction."""
-        step = cast(step, self.grid.h.dtype)
-        tensions = [
-            tension * pull_of(self.sections, place, self.length)
-            for place, tension in zip(self.kind.cables, step.tension, strict=True)
-        ]
-        moved = self._largest(shape_size(step.xi, self.length))
-        return sum((self._largest(x) for x in (*tensions, *self._rubbed(step.turning, at))), moved)
+        """Largest change of the shape, plus those of the couplings."""
+        step = cast(step, self.problem.grid.h.dtype)
+        moved = self._largest(shape_size(step.xi, self.problem.length))
+        for coupling, x in zip(self.problem.couplings, step.coupled, strict=True):
+            moved = sum(map(self._largest, coupling.sizes(x, at, self.problem)), moved)
+        return moved
 
     def of_imbalance(self, imbalance: ArmImbalance, at: ArmState) -> Array:
-        """Root mean square of all rows; that of a cable is its slack per length of the arm."""
-        wrench = spread(imbalance.wrench, self.kind.free)
-        bent = shape_of(wrench, self.sections.stiffness, self.length)
-        square = jnp.sum(self.grid.weight * bent**2, axis=(0, 1)) / self.length
-        axial = largest_force_scale(self.sections.stiffness)
-        others = (
-            *(force / axial for force in imbalance.cable),
-            *self._rubbed(imbalance.turning, at),
-        )
-        return jnp.sqrt(sum((jnp.mean(x**2, axis=self._inner(x)) for x in others), square))
+        """Root mean square of all rows."""
+        grid, length = self.problem.grid, self.problem.length
+        wrench = spread(imbalance.wrench, self.free)
+        bent = shape_of(wrench, self.problem.sections.stiffness, length)
+        square = jnp.sum(grid.weight * bent**2, axis=(0, 1)) / length
+        for coupling, rows in zip(self.problem.couplings, imbalance.coupled, strict=True):
+            for size in coupling.row_sizes(rows, at, self.problem):
+                square = square + jnp.mean(size**2, axis=self._inner(size))
+        return jnp.sqrt(square)
 
     def turn(self, step: ArmUnknown) -> Array:
         """Total angle by which the step bends and twists the arm [rad]."""
-        x, y, z = (jnp.abs(k) for k in cast(step.xi[:3], self.grid.h.dtype))
-        return jnp.sum(self.grid.weight * (x + y + z), axis=(0, 1))
+        x, y, z = (jnp.abs(k) for k in cast(step.xi[:3], self.problem.grid.h.dtype))
+        return jnp.sum(self.problem.grid.weight * (x + y + z), axis=(0, 1))
 
     def work(self, wrench: Vector, step: ArmUnknown) -> Array:
         """Work of the residual over a step, in single precision: only its sign and rough size
         matter."""
         work = jnp.sum(
-            c.single(self.grid.weight) * c.dot(wrench, free_components(step.xi, self.kind.free)),
+            c.single(self.problem.grid.weight) * c.dot(wrench, free_components(step.xi, self.free)),
             axis=(0, 1),
         )
-        return work.astype(self.grid.h.dtype)
-
-    def _rubbed(self, rates: Vector, at: ArmState) -> list[Array]:
-        """Changes of turning rates, scaled by their effect on the tensions."""
-        pulls = [pull_of(self.sections, place, self.length) for place in self.kind.frictional]
-        return [
-            self.length * at.tau[p] * rate * pull
-            for p, rate, pull in zip(self.kind.frictional, rates, pulls, strict=True)
-        ]
+        return work.astype(self.problem.grid.h.dtype)
 
     def _inner(self, x: Array) -> tuple[int, ...]:
         return tuple(range(x.ndim - len(self.arms)))
@@ -177,19 +145,21 @@ class _Sizes(NamedTuple):
         return jnp.max(jnp.abs(x), axis=self._inner(x))
 
 
-def _solve(kind: Kind, origin: ArmUnknown, guess: ArmUnknown | None, whole: ArmProblem) -> Root:
+def _solve(
+    free: tuple[int, ...], origin: ArmUnknown, guess: ArmUnknown | None, whole: ArmProblem
+) -> Root:
     arms = arms_in((origin, guess, whole), whole.grid.h.ndim - 1)
     start, origin = jax.tree.map(
         lambda x: jnp.broadcast_to(x, (*x.shape[: x.ndim - len(arms)], *arms)),
         (origin if guess is None else guess, origin),
     )
-    sizes = _Sizes(whole.grid, whole.sections, kind, arms)
+    sizes = _Sizes(whole, free, arms)
 
     def evaluate(unknown: ArmUnknown, damping: Array, share: Array) -> Damped:
         problem = whole.with_share(share)
-        at = state_of(unknown, problem, kind)
-        imbalance = imbalance_of(unknown, at, problem, kind)
-        step, definite, doubtful = approximate_solve(unknown, at, imbalance, problem, kind, damping)
+        at = state_of(unknown.xi, unknown.coupled, problem)
+        imbalance = imbalance_of(unknown, at, problem, free)
+        step, definite, doubtful = approximate_solve(unknown, at, imbalance, problem, free, damping)
         size = sizes.of_step(step, at)
         # A step that coils the arm may lower the residual without approaching a solution.
         cut = jnp.minimum(1.0, MAX_TURN / jnp.maximum(sizes.turn(step), MAX_TURN))

@@ -10,15 +10,17 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from ..numerics import component as c, lu
+from ..numerics import component as c
 from ..numerics.component import Vector
 from ..typing import cast
-from .arm_balance import ArmImbalance, ArmProblem, ArmState, ArmUnknown, Kind, state_of
-from .balance import free_components, spread, tangent, thread_direction, thread_wrench
+from .arm_balance import ArmImbalance, ArmUnknown, state_of
+from .balance import free_components, spread, tangent
+from .coupling import ArmProblem, ArmState, bordered_solve, borders_of
 from .elimination import eliminate
 from .elimination_nodes import Definiteness
 from .pose_elimination import eliminate_poses
 from .reaction import slopes_of
+from .sizes import node_weight
 
 _REFINEMENTS = 60
 """Bound on the refinement steps of a tangent system; 5 to 10 are usual."""
@@ -35,12 +37,12 @@ def approximate_solve(
     at: ArmState,
     right: ArmImbalance,
     problem: ArmProblem,
-    kind: Kind,
+    free: tuple[int, ...],
     damping: Array | float = 0.0,
 ) -> tuple[ArmUnknown, Array, Array]:
-    """Approximate solution of the tangent system (see `elimination`; the tangent of friction is
-    neglected), whether it is definite for the changes of shape that taut cables allow, and whether
-    that is doubtful.
+    """Approximate solution of the tangent system (see `elimination`; a coupling without a border
+    has the tangent 1), whether it is definite for the changes of shape that the couplings allow,
+    and whether that is doubtful.
 
     In single precision throughout: the passes along the arm are bound by memory, and rounding is
     far below the error of the elimination.
@@ -59,86 +61,48 @@ def approximate_solve(
 
     def solve(b: Vector) -> tuple[Vector, Definiteness]:
         if along is not None and slopes is not None and slopes.motion == 6:
-            return eliminate_poses(lower, b, unknown.xi, along, slopes, grid, kind.free)
-        return eliminate(lower, b, along, slopes, grid, kind.free)
+            return eliminate_poses(lower, b, unknown.xi, along, slopes, grid, free)
+        return eliminate(lower, b, along, slopes, grid, free)
 
-    strain, (negative, doubtful) = solve(spread(right.wrench, kind.free))
-    if not kind.cables:
-        return ArmUnknown(strain, (), right.turning), negative == 0, doubtful
-    units = [
-        thread_wrench(thread_direction(unknown.xi, sections.paths[i])[0], sections.paths[i])
-        for i in kind.cables
-    ]
-    pulls = [c.times(at.carried[i], unit) for i, unit in zip(kind.cables, units, strict=True)]
-    lengths = [c.times(sections.reach[i], unit) for i, unit in zip(kind.cables, units, strict=True)]
-    answers, _ = jax.vmap(solve)(jax.tree.map(lambda *v: jnp.stack(v), *pulls))
-    shortening = jnp.stack(
-        [jnp.sum(grid.weight * c.dot(length, answers), axis=(1, 2)) for length in lengths]
-    )
-    given = jnp.stack(
-        [jnp.sum(grid.weight * c.dot(length, strain), axis=(0, 1)) for length in lengths]
-    )
-    tension, held = _tensions(unknown, at, right, problem, kind, shortening, given)
-    strain = tuple(
-        a - jnp.sum(tension[:, None, None] * answer, axis=0)
-        for a, answer in zip(strain, answers, strict=True)
-    )
-    return ArmUnknown(strain, tuple(tension), right.turning), negative == held, doubtful
-
-
-def _tensions(
-    unknown: ArmUnknown,
-    at: ArmState,
-    right: ArmImbalance,
-    problem: ArmProblem,
-    kind: Kind,
-    shortening: Array,
-    given: Array,
-) -> tuple[Array, Array]:
-    """Tensions of the cables from the Schur complement of the strains, and the number of its
-    negative pivots.
-
-    `shortening`: of each cable's path per tension of each. Each negative pivot is an unstable
-    motion of the arm alone that taut cables prevent: the arm is stable if the tangent has no more
-    negative eigenvalues than that."""
-    rows, sides = [], []
-    for i, (place, cable, tension, slack) in enumerate(
-        zip(kind.cables, problem.cables, unknown.tension, at.slack, strict=True)
-    ):
-        slack_now = tension < cable.scale * slack
-        unit = jnp.zeros_like(given).at[i].set(1.0)
-        row = shortening[i]
-        if cable.compliance is not None:
-            row = row + unit * cable.stretch(at.carried[place], problem.grid)
-        rows.append(jnp.where(slack_now, unit, cable.scale * row))
-        sides.append(jnp.where(slack_now, right.cable[i], right.cable[i] + cable.scale * given[i]))
-    factors = lu.factor(jnp.stack(rows))
-    return lu.substitute(factors, jnp.stack(sides)), jnp.sum(
-        lu.diagonal(factors) < 0, axis=0, dtype=jnp.int32
-    )
+    strain, (negative, doubtful) = solve(spread(right.wrench, free))
+    places, border = borders_of(problem, unknown.coupled, at)
+    if border is None:
+        return ArmUnknown(strain, right.coupled), negative == 0, doubtful
+    rows = jnp.concatenate([right.coupled[place] for place in places])
+    strain, x, held = bordered_solve(lambda b: solve(b)[0], strain, rows, border, grid)
+    coupled, first = list(right.coupled), 0
+    for place in places:
+        last = first + len(right.coupled[place])
+        coupled[place], first = x[first:last], last
+    return ArmUnknown(strain, tuple(coupled)), negative == held, doubtful
 
 
 def tangent_solve(
-    apply: Callable, unknown: ArmUnknown, problem: ArmProblem, right: ArmImbalance, kind: Kind
+    apply: Callable,
+    unknown: ArmUnknown,
+    problem: ArmProblem,
+    right: ArmImbalance,
+    free: tuple[int, ...],
 ) -> ArmUnknown:
     r"""Solution of the exact tangent system $A x = b$, with `approximate_solve` as preconditioner;
     NaN where not found.
 
     All entries are scaled by energies: a change of strain $\delta\xi$ becomes $\sqrt{\Sigma
-    w}\,\delta\xi$, a wrench $\sqrt{w / \Sigma}\,r$, with the weight w of its node, and tensions and
-    turning rates likewise. The scaled A is the identity plus the terms of loads and threads. It is
-    symmetric where these have a potential, so that one norm serves both modes of differentiation.
+    w}\,\delta\xi$, a wrench $\sqrt{w / \Sigma}\,r$, with the weight w of its node, and the unknowns
+    and rows of couplings likewise (`Coupling.units`). The scaled A is the identity plus the terms
+    of loads and threads. It is symmetric where these have a potential, so that one norm serves both
+    modes of differentiation.
 
     **Arguments:** `apply`: product with A; of `unknown` and the result only the free strains count.
     """
-    at = state_of(unknown, problem, kind)
+    at = state_of(unknown.xi, unknown.coupled, problem)
     flat, unravel_row = ravel_pytree(right)
-    _, unravel_change = ravel_pytree(_free_part(unknown, kind))
-    to_row, to_change = lax.stop_gradient(_units(problem, kind, right))
+    _, unravel_change = ravel_pytree(_free_part(unknown, free))
+    to_row, to_change = lax.stop_gradient(_units(problem, free, right))
 
     def nearly(b: ArmImbalance) -> ArmUnknown:
-        step, _, _ = approximate_solve(unknown, at, b, problem, kind)
-        return _free_part(cast(step, problem.grid.h.dtype), kind)
+        step, _, _ = approximate_solve(unknown, at, b, problem, free)
+        return _free_part(cast(step, problem.grid.h.dtype), free)
 
     def scaled_apply(x: Array) -> Array:
         return to_row * ravel_pytree(apply(unravel_change(to_change * x)))[0]
@@ -162,24 +126,18 @@ def tangent_solve(
     )
 
 
-def _free_part(unknown: ArmUnknown, kind: Kind) -> ArmUnknown:
-    return unknown._replace(xi=free_components(unknown.xi, kind.free))
+def _free_part(unknown: ArmUnknown, free: tuple[int, ...]) -> ArmUnknown:
+    return unknown._replace(xi=free_components(unknown.xi, free))
 
 
-def _units(problem: ArmProblem, kind: Kind, like: ArmImbalance) -> tuple[Array, Array]:
+def _units(problem: ArmProblem, free: tuple[int, ...], like: ArmImbalance) -> tuple[Array, Array]:
     """Factors from rows of the residual to scaled rows, and from scaled changes of the unknowns to
     changes."""
-    stiffness, weight = problem.sections.stiffness, problem.grid.weight
-    weight = jnp.maximum(weight, 1e-6 * jnp.max(weight))  # 0 at an empty step
-    root = tuple(jnp.sqrt(weight * s) for s in free_components(stiffness, kind.free))
-    turn = jnp.sqrt(weight * jnp.minimum(stiffness[1], stiffness[2]))
-    tension = tuple(jnp.sqrt(cable.scale) for cable in problem.cables)
-    rows = ArmImbalance(
-        tuple(weight / x for x in root),
-        tuple(1 / x for x in tension),
-        (turn,) * len(kind.frictional),
-    )
-    changes = ArmImbalance(tuple(1 / x for x in root), tension, (1 / turn,) * len(kind.frictional))
+    stiffness, weight = problem.sections.stiffness, node_weight(problem.grid)
+    root = tuple(jnp.sqrt(weight * s) for s in free_components(stiffness, free))
+    pairs = [coupling.units(problem) for coupling in problem.couplings]
+    rows = ArmImbalance(tuple(weight / x for x in root), tuple(row for row, _ in pairs))
+    changes = ArmImbalance(tuple(1 / x for x in root), tuple(change for _, change in pairs))
     row, change = (
         ravel_pytree(jax.tree.map(lambda x, y: jnp.broadcast_to(x, y.shape), tree, like))[0]
         for tree in (rows, changes)

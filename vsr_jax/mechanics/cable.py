@@ -1,20 +1,28 @@
-r"""Tendons with prescribed length: slack and tension of the cable, and the length of a thread's
-path.
+r"""Tendons with prescribed length.
 
 A cable of free length $l^* + \delta$ under the tension T has the length $(l^* + \delta)(1 + T /
-k)$; its slack is that length minus the length of the path."""
+k)$; its slack is that length minus the length of the path, $l = \int |t_c| dX$. The unknown is T
+and its row
+
+$$\min(T, k_0 s) = 0, \quad s = (l^* + \delta)(1 + T / k) - l,$$
+
+the complementarity of tension and slack, where the stiffness $k_0$ [N/m] only scales the two.
+"""
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from ..arm.scene import CrossSections, Scene
 from ..numerics import component as c
-from ..numerics.component import Vector
+from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import Grid
 from ..typing import Scalar
-from .balance import largest_force_scale, thread_direction
+from .balance import largest_force_scale, thread_direction, thread_wrench
+from .coupling import ArmProblem, ArmState, Border, Coupling
+from .sizes import pull_of
 
 
 class Cable(NamedTuple):
@@ -29,11 +37,6 @@ class Cable(NamedTuple):
         """Slack on a path of a given length [m], negative if the cable is too short."""
         return self.length - path + tension * self.stretch(share, grid)
 
-    def complementarity(self, tension: Array, slack: Array) -> Array:
-        r"""$\min(T, k_0 s)$ [N], zero where tension or slack is zero and the other is not
-        negative."""
-        return jnp.where(tension < self.scale * slack, tension, self.scale * slack)
-
     def stretch(self, share: Array | None, grid: Grid) -> Array:
         """Stretch per unit of the tension at the start [m/N]; `share` is the fraction of it at the
         nodes."""
@@ -44,6 +47,89 @@ class Cable(NamedTuple):
         reached = jnp.sum(jnp.where(share > 0, grid.weight, 0.0), axis=(0, 1))
         mean = jnp.sum(grid.weight * share, axis=(0, 1)) / reached
         return self.length * self.compliance * mean
+
+
+class Lengths(Coupling):
+    """All tendons of an arm with prescribed lengths; the unknowns are their tensions [N], shape
+    (cables, ...). `places`: their places among the threads."""
+
+    places: tuple[int, ...] = eqx.field(static=True)
+    cables: tuple[Cable, ...]
+
+    def relaxed(self) -> "Lengths":
+        longer = tuple(cable._replace(length=2 * cable.length) for cable in self.cables)
+        return Lengths(self.places, longer)
+
+    def guess(self, forces: Forces, grid: Grid) -> Float[Array, "cables ..."]:
+        tensions = [jnp.broadcast_to(-forces[place], grid.h.shape[1:]) for place in self.places]
+        return jnp.stack(tensions)
+
+    def forces(self, x: Array, forces: Forces) -> Forces:
+        found = list(forces)
+        for place, tension in zip(self.places, x, strict=True):
+            found[place] = -tension
+        return tuple(found)
+
+    def note(self, x: Array, at: ArmState, problem: ArmProblem) -> Vector:
+        """Slack of each [m]."""
+        grid, sections = problem.grid, problem.sections
+        return tuple(
+            cable.slack(tension, path_length(at.xi, sections, place, grid), at.shares[place], grid)
+            for place, cable, tension in zip(self.places, self.cables, x, strict=True)
+        )
+
+    def residual(
+        self, x: Array, at: ArmState, note: Vector, problem: ArmProblem, free: tuple[int, ...]
+    ) -> Array:
+        scaled = [cable.scale * slack for cable, slack in zip(self.cables, note, strict=True)]
+        pairs = zip(x, scaled, strict=True)
+        return jnp.stack([jnp.where(tension < slack, tension, slack) for tension, slack in pairs])
+
+    def border(self, x: Array, at: ArmState, note: Vector, problem: ArmProblem) -> Border:
+        sections, grid = problem.sections, problem.grid
+        paths = [sections.paths[place] for place in self.places]
+        wrenches = [thread_wrench(thread_direction(at.xi, path)[0], path) for path in paths]
+        pairs = list(zip(self.places, wrenches, strict=True))
+        factors, corner = [], []
+        for place, cable, tension, slack in zip(self.places, self.cables, x, note, strict=True):
+            loose = tension < cable.scale * slack
+            factors.append(jnp.where(loose, 0.0, -cable.scale))
+            stretch = cable.scale * cable.stretch(at.shares[place], grid)
+            corner.append(jnp.where(loose, 1.0, stretch))
+        return Border(
+            tuple(c.times(at.shares[place], wrench) for place, wrench in pairs),
+            tuple(c.times(sections.reach[place], wrench) for place, wrench in pairs),
+            jnp.stack(factors),
+            jnp.stack(corner),
+        )
+
+    def sizes(self, x: Array, at: ArmState, problem: ArmProblem) -> list[Array]:
+        length = problem.length
+        return [
+            tension * pull_of(problem.sections, place, length)
+            for place, tension in zip(self.places, x, strict=True)
+        ]
+
+    def row_sizes(self, rows: Array, at: ArmState, problem: ArmProblem) -> list[Array]:
+        """Slack per length of the arm."""
+        axial = largest_force_scale(problem.sections.stiffness)
+        return [row / axial for row in rows]
+
+    def units(self, problem: ArmProblem) -> tuple[Array, Array]:
+        change = jnp.stack([jnp.sqrt(cable.scale) for cable in self.cables])
+        return 1 / change, change
+
+    def radians(self, problem: ArmProblem) -> Array:
+        weight = problem.grid.weight
+        axial = jnp.sum(weight * problem.sections.stiffness[3]) / problem.length
+        return jnp.broadcast_to(1 / axial, (len(self.cables),))
+
+
+def lengths_of(scene: Scene, inputs: Array, sections: CrossSections, grid: Grid) -> Lengths | None:
+    """The cables of a scene, for changes of their lengths [m]; None if it has none."""
+    places = scene.length_driven
+    cables = tuple(cable_of(scene, inputs[place], place, sections, grid) for place in places)
+    return Lengths(places, cables) if places else None
 
 
 def cable_of(

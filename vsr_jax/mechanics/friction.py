@@ -10,32 +10,130 @@ derivative of the strain along the arm follows from the balance, $H \xi' = \Lamb
 \partial X + B_\tau \tau'$, without finite differences.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..arm.routing import thread_tangent
-from ..arm.scene import CrossSections
+from ..arm.scene import CrossSections, Scene
 from ..numerics import component as c
 from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import Grid, beyond, interpolation, locate, weighted, within
+from ..numerics.stacked import components
 from .balance import actuation_wrench, completed, free_block, free_components, residual, tangent
+from .coupling import ArmProblem, ArmState, Coupling, Shares
+from .sizes import node_weight, pull_of, softest
 
 
-class Friction(NamedTuple):
-    r"""Friction of the tendons that have it.
+class Friction(Coupling):
+    r"""All tendons of an arm with friction. The unknowns are the turning rates $\varphi'$ [rad/m]
+    of their paths at the nodes, one array per tendon, and the rows their differences from those of
+    the paths.
 
-    - `coefficients`: $\pm\mu$ of each, positive for pull.
+    - `places`: their places among the threads. `coefficients`: $\pm\mu$ of each, positive for pull.
     - `sections_rate`: $\partial / \partial X$ of the cross-sections at the nodes.
     - `breaks`: 1 for each step that starts at a breakpoint, where paths may have kinks; None if the
       arm has no breakpoints.
     """
 
+    follows_rate = True
+    places: tuple[int, ...] = eqx.field(static=True)
     coefficients: Vector
     sections_rate: CrossSections
     breaks: Array | None
+
+    def relaxed(self) -> "Friction":
+        return self
+
+    def guess(self, forces: Forces, grid: Grid) -> Vector:
+        return (jnp.zeros_like(grid.X),) * len(self.places)
+
+    def shares(
+        self, x: Vector, xi: Vector, sections: CrossSections, grid: Grid, shares: Shares
+    ) -> Shares:
+        found = list(shares)
+        for place, turning, mu in zip(self.places, x, self.coefficients, strict=True):
+            kinks = kinks_of(xi, sections, self.breaks, place, grid)
+            found[place] = share_left(found[place], turning, kinks, mu, grid)
+        return tuple(found)
+
+    def shares_at(
+        self, x: Vector, xi: Vector, scene: Scene, grid: Grid, X: Array, shares: Shares
+    ) -> Shares:
+        sections, found = scene.sections(grid.X), list(shares)
+        for place, rate, mu in zip(self.places, x, self.coefficients, strict=True):
+            reach, kinks = sections.reach[place], kinks_of(xi, sections, self.breaks, place, grid)
+            found[place] = c.times(
+                shares[place], decay_at(c.times(reach, rate), kinks, mu, grid, X)
+            )
+        return tuple(found)
+
+    def residual(
+        self, x: Vector, at: ArmState, note: None, problem: ArmProblem, free: tuple[int, ...]
+    ) -> Vector:
+        xi, sections = at.xi, problem.sections
+        slopes = [jnp.zeros_like(xi[0])] * len(at.tau)
+        for place, turning, mu in zip(self.places, x, self.coefficients, strict=True):
+            slopes[place] = -mu * turning * at.tau[place]
+        change = None
+        if at.along is not None:
+            wrench, density = components(at.along.wrench), components(at.along.body_density)
+            change = reaction_rate(xi, wrench, density)
+        tau = tuple(jnp.broadcast_to(force, xi[0].shape) for force in at.tau)
+        xi_rate = balanced_strain_rate(
+            xi, tau, tuple(slopes), change, sections, self.sections_rate, free
+        )
+        return c.subtract(x, self._rates(xi, xi_rate, sections))
+
+    def from_rate(self, xi: Vector, rate: Vector, sections: CrossSections) -> Vector:
+        return self._rates(xi, c.add(rate, self.sections_rate.rest), sections)
+
+    def _rates(self, xi: Vector, xi_rate: Vector, sections: CrossSections) -> Vector:
+        return tuple(
+            turning_rate(xi, xi_rate, sections, self.sections_rate, place) for place in self.places
+        )
+
+    def moved(self, x: Vector, X: Array, grid: Grid) -> Vector:
+        nodes = X.T.reshape(-1)
+        return tuple(jnp.interp(grid.X, nodes, rate.T.reshape(-1)) for rate in x)
+
+    def sizes(self, x: Vector, at: ArmState, problem: ArmProblem) -> list[Array]:
+        """By the effect of the rates on the tensions."""
+        length = problem.length
+        pulls = [pull_of(problem.sections, place, length) for place in self.places]
+        return [
+            length * at.tau[place] * rate * pull
+            for place, rate, pull in zip(self.places, x, pulls, strict=True)
+        ]
+
+    def row_sizes(self, rows: Vector, at: ArmState, problem: ArmProblem) -> list[Array]:
+        return self.sizes(rows, at, problem)
+
+    def units(self, problem: ArmProblem) -> tuple[Vector, Vector]:
+        turn = jnp.sqrt(node_weight(problem.grid) * softest(problem.sections.stiffness))
+        return (turn,) * len(self.places), (1 / turn,) * len(self.places)
+
+    def radians(self, problem: ArmProblem) -> Vector:
+        return (jnp.sqrt(problem.grid.weight * problem.length),) * len(self.places)
+
+
+def friction_of(scene: Scene, grid: Grid) -> Friction | None:
+    """The friction of a scene's tendons on a grid; None without."""
+    places = scene.frictional
+    if not places:
+        return None
+    _, rate = jax.jvp(scene.sections, (grid.X,), (jnp.ones_like(grid.X),))
+    coefficients = tuple(_coefficient(scene, place) for place in places)
+    return Friction(places, coefficients, rate, breaks_of(scene.breakpoints, grid))
+
+
+def _coefficient(scene: Scene, place: int) -> Array:
+    friction = scene.actuators[place].signed_friction
+    assert friction is not None  # see Scene.frictional
+    return friction
 
 
 def decay(turning: Array, kinks: Array | None, coefficient: Array, grid: Grid) -> Array:

@@ -13,7 +13,9 @@ from jaxtyping import Array, Float
 
 from ..arm.routing import Path, thread_tangent
 from ..arm.scene import CrossSections, Scene, shared
+from ..mechanics.arm_balance import ArmUnknown, problem_of
 from ..mechanics.balance import thread_direction, thread_wrench
+from ..mechanics.coupling import ArmProblem
 from ..mechanics.resolution import COARSE, step_error
 from ..numerics.component import Forces, Vector, dot
 from ..numerics.magnus import step_components, step_poses, tip_pose
@@ -158,10 +160,14 @@ class Model(eqx.Module):
         xi = self.strain(scene, forces, state, grid.X.reshape(-1))
         return tuple(x.reshape(grid.X.shape) for x in xi)
 
-    def turning(self, scene: Scene, state: Any, grid: Grid) -> Vector:
-        """Turning rates [rad/m] of the tendons with friction at the nodes of a grid, a first guess
-        of another solution there; zero by default."""
-        return (jnp.zeros_like(grid.X),) * len(scene.frictional)
+    def unknowns_on(
+        self, scene: Scene, forces: Forces, state: Any, problem: ArmProblem
+    ) -> ArmUnknown:
+        """Unknowns of the coupled balance on another grid, a first guess of the solution of a
+        problem there."""
+        xi = self.strain_on(scene, forces, state, problem.grid)
+        coupled = tuple(one.guess(forces, problem.grid) for one in problem.couplings)
+        return ArmUnknown(xi, coupled)
 
     def dof_labels(self, size: int) -> tuple[tuple[str, str], ...] | None:
         """Name and unit of each of the `size` coordinates; None where they are the forces of the
@@ -251,10 +257,11 @@ class SteppedModel(Model):
         self, scene: Scene, inputs: Array, forces: Forces, state: Any, grid: Grid
     ) -> tuple[Vector, Vector]:
         """The strain on a grid, and that corrected there."""
-        xi = self.strain_on(scene, forces, state, grid)
         if scene.coupled:
-            turning = self.turning(scene, state, grid)
-            return xi, corrected_strain(scene, inputs, forces, xi, turning, grid)
+            problem = problem_of(scene, inputs, grid)
+            unknown = self.unknowns_on(scene, forces, state, problem)
+            return unknown.xi, corrected_strain(problem, unknown, scene.free)
+        xi = self.strain_on(scene, forces, state, grid)
         return xi, xi if self.balanced_everywhere else balanced_strain(scene, forces, xi, grid)
 
     def poses(

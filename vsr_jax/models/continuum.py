@@ -11,7 +11,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..arm.scene import CrossSections, Scene
-from ..mechanics.arm_balance import shares_at
 from ..mechanics.balance import (
     ALL,
     forces_where,
@@ -148,7 +147,7 @@ class Continuum(Model):
             grid,
             xi,
             scene.sections(grid.X),
-            shares_at(scene, on_steps.xi, on_steps.turning, grid, grid.X),
+            on_steps.shares_at(scene, grid, grid.X),
         )
 
     def finer(self) -> "Continuum":
@@ -242,7 +241,7 @@ def _shoot(model: Continuum, scene: Scene, inputs: Array) -> tuple[Shot, Guess, 
     steps = model.derivative
     found = steps.solve(scene, inputs)
     grid, segments = steps.grid(scene), make_grid(scene.edges(), model.segments, 1)
-    guess = Guess(grid, found.state.xi, found.forces, found.state.turning)
+    guess = Guess(grid, found.state, found.forces)
     loads = loading(scene, grid)
     zero = jnp.zeros_like(segments.start)
     wrench = (zero,) * 6 if loads is None else react_at(found.state.xi, grid, loads, segments.start)

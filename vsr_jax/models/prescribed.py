@@ -11,7 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..arm.scene import CrossSections, Scene
-from ..mechanics.arm_balance import problem_of, with_tensions
+from ..mechanics.arm_balance import problem_of
 from ..mechanics.balance import (
     force_scale,
     forces_where,
@@ -22,12 +22,13 @@ from ..mechanics.balance import (
     thread_wrench,
     without_force,
 )
+from ..mechanics.coupling import ArmProblem, forces_at
 from ..numerics import component as c, lu
 from ..numerics.component import Forces, Vector
 from ..numerics.implicit import implicit_root
 from ..numerics.magnus import ORDERS, accumulate_jacobian
 from ..numerics.newton import Evaluation, Root, newton
-from ..numerics.quadrature import Grid, make_grid, onto
+from ..numerics.quadrature import make_grid, onto
 from ..typing import Scalar
 from ..validation import ROUNDING, choice, count, instance, on_arm
 from . import prescribed_loaded
@@ -154,21 +155,21 @@ class Prescribed(SteppedModel):
         return Outcome(jnp.where(status == Status.CONVERGED, q, 0.0), forces, status, steps)
 
     def _solve_together(self, scene: Scene, inputs: Float[Array, " inputs"]) -> Outcome:
-        problem, kind = problem_of(scene, inputs, self.grid(scene))
-        basis = self._at_nodes(scene, problem.grid)
-        (q, tensions), balanced, definite, steps = solve_prescribed(basis, problem, kind)
-        forces = with_tensions(problem.forces, tensions, kind)
-        at = prescribed_loaded.state_of(
-            prescribed_loaded.GalerkinUnknown(q, tensions), basis, problem, kind
-        )
+        problem = problem_of(scene, inputs, self.grid(scene))
+        basis = self._at_nodes(scene, problem)
+        unknown, balanced, definite, steps = solve_prescribed(basis, problem)
+        q, coupled = unknown.q, prescribed_loaded.coupled_of(unknown, basis, problem)
+        forces = forces_at(problem.couplings, coupled, problem.forces)
+        at = prescribed_loaded.state_of(unknown, basis, problem)
         status = classify(
             at.xi, problem.sections, at.tau, balanced, definite, loaded=bool(scene.loads)
         )
         sound = status == Status.CONVERGED
         return Outcome(jnp.where(sound, q, 0.0), forces_where(sound, forces), status, steps)
 
-    def _at_nodes(self, scene: Scene, grid: Grid) -> prescribed_loaded.NodalBasis:
-        X = grid.X.reshape(-1)
+    def _at_nodes(self, scene: Scene, problem: ArmProblem) -> prescribed_loaded.NodalBasis:
+        X = problem.grid.X.reshape(-1)
+        rated = any(coupling.follows_rate for coupling in problem.couplings)
 
         def at(x: Scalar) -> Array:
             return self.basis.matrix(x, scene.rod.length)
@@ -176,8 +177,8 @@ class Prescribed(SteppedModel):
         def with_rate(x: Scalar) -> tuple[Array, Array]:
             return jax.jvp(at, (x,), (jnp.ones_like(x),))
 
-        matrix, rate = jax.vmap(with_rate)(X) if scene.frictional else (jax.vmap(at)(X), None)
-        shape = (*grid.X.shape, 6, self.basis.size)
+        matrix, rate = jax.vmap(with_rate)(X) if rated else (jax.vmap(at)(X), None)
+        shape = (*problem.grid.X.shape, 6, self.basis.size)
         return prescribed_loaded.NodalBasis(
             matrix.reshape(shape), None if rate is None else rate.reshape(shape)
         )
@@ -203,13 +204,10 @@ class Prescribed(SteppedModel):
         xi, sections = self.node_strain(scene, state), scene.sections(grid.X)
         if not scene.frictional:
             return Nodes(grid, xi, sections, sections.reach)
-        problem, kind = problem_of(scene, jnp.zeros(len(scene.actuators), grid.h.dtype), grid)
-        return Nodes(
-            grid,
-            xi,
-            sections,
-            prescribed_loaded.shares(xi, state, self._at_nodes(scene, grid), problem, kind),
-        )
+        problem = problem_of(scene, jnp.zeros(len(scene.actuators), grid.h.dtype), grid)
+        basis, unknown = self._at_nodes(scene, problem), prescribed_loaded.start(state, problem)
+        shares = prescribed_loaded.state_of(unknown, basis, problem).shares
+        return Nodes(grid, xi, sections, shares)
 
     def strain(
         self, scene: Scene, forces: Forces, state: Array, X: Float[Array, " stations"]

@@ -16,9 +16,10 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..arm.scene import Scene
-from ..mechanics.arm_balance import ArmUnknown, imbalance_of, problem_of, state_of
+from ..mechanics.arm_balance import ArmUnknown, imbalance_of, state_of
 from ..mechanics.arm_tangent import approximate_solve
 from ..mechanics.balance import solve_balance
+from ..mechanics.coupling import ArmProblem
 from ..numerics import component as c
 from ..numerics.component import Forces, Vector
 from ..numerics.magnus import tip_pose
@@ -63,14 +64,9 @@ def balanced_strain(scene: Scene, forces: Forces, xi: Vector, grid: Grid) -> Vec
     return solve_balance(sections, sections.carry(forces), None, scene.free, xi).xi
 
 
-def corrected_strain(
-    scene: Scene, inputs: Array, forces: Forces, xi: Vector, turning: Vector, grid: Grid
-) -> Vector:
-    """Strain of a coupled arm on a grid, corrected by a Newton step from the strain xi and the
-    turning rates there."""
-    problem, kind = problem_of(scene, inputs, grid)
-    unknown = ArmUnknown(xi, tuple(-forces[place] for place in kind.cables), turning)
-    at = state_of(unknown, problem, kind)
-    imbalance = imbalance_of(unknown, at, problem, kind)
-    step, _, _ = approximate_solve(unknown, at, imbalance, problem, kind)
-    return c.subtract(unknown, cast(step, xi[0].dtype)).xi
+def corrected_strain(problem: ArmProblem, unknown: ArmUnknown, free: tuple[int, ...]) -> Vector:
+    """Strain of a coupled arm, corrected by a Newton step from the given unknowns."""
+    at = state_of(unknown.xi, unknown.coupled, problem)
+    imbalance = imbalance_of(unknown, at, problem, free)
+    step, _, _ = approximate_solve(unknown, at, imbalance, problem, free)
+    return c.subtract(unknown, cast(step, unknown.xi[0].dtype)).xi

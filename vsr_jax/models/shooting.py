@@ -25,7 +25,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ..arm.scene import CrossSections, Scene, shared
-from ..mechanics.arm_balance import shares_at
+from ..mechanics.arm_balance import ArmSolution
 from ..mechanics.balance import solve_balance
 from ..mechanics.friction import balanced_strain_rate, reaction_rate
 from ..numerics import component as c
@@ -47,13 +47,11 @@ def _inside(dtype: Any) -> float:
 
 
 class Guess(NamedTuple):
-    """A solution on steps: its grid, strain there, the thread forces at their start and the turning
-    rates of tendons with friction."""
+    """A solution on steps: its grid, the state there, and the thread forces at their start."""
 
     grid: Grid
-    xi: Vector
+    state: ArmSolution
     forces: Forces
-    turning: Vector
 
 
 class ShootingUnknown(NamedTuple):
@@ -111,7 +109,7 @@ def integrate(
 
     def at(t: Array) -> tuple[Array, CrossSections, Vector]:
         x = start + h * (inside + (1 - 2 * inside) * t)
-        shares = shares_at(scene, guess.xi, guess.turning, guess.grid, x)
+        shares = guess.state.shares_at(scene, guess.grid, x)
         return x, scene.sections(x), shared(guess.forces, shares)
 
     def field(t: Any, line: SegmentState, _: None) -> SegmentState:

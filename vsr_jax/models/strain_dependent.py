@@ -6,12 +6,13 @@ and all nodes are solved together (see `arm_balance`).
 """
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
 from ..arm.scene import Scene, shared
-from ..mechanics.arm_balance import ArmUnknown, carried_forces, problem_of, shares_at, with_tensions
+from ..mechanics.arm_balance import ArmSolution, ArmUnknown, carried_forces, problem_of
 from ..mechanics.arm_solve import solve_arm
 from ..mechanics.balance import (
     forces_where,
@@ -22,6 +23,7 @@ from ..mechanics.balance import (
     spread,
     strain_norm,
 )
+from ..mechanics.coupling import ArmProblem, forces_at
 from ..mechanics.reaction import loading, react_at
 from ..numerics.component import Forces, Vector
 from ..numerics.magnus import ORDERS
@@ -55,7 +57,7 @@ class StrainDependent(SteppedModel):
 
     def solve(self, scene: Scene, inputs: Float[Array, " inputs"]) -> Outcome:
         if scene.coupled:
-            return self._solve_together(scene, inputs)
+            return self._solve_together(scene, problem_of(scene, inputs, self.grid(scene)))
         sections, forces = scene.sections(self.grid(scene).X), scene.forces(inputs)
         tau = sections.carry(forces)
         solution = solve_balance(sections, tau, None, scene.free)
@@ -63,48 +65,46 @@ class StrainDependent(SteppedModel):
         status = jnp.where(
             status == Status.CONVERGED, _status_of_ends(scene, forces, solution.xi), status
         )
-        state = ArmUnknown(rest_where_failed(status, solution.xi, sections), (), ())
+        state = ArmSolution(rest_where_failed(status, solution.xi, sections), (), ())
         return Outcome(state, forces, status, solution.steps)
 
     def solve_from(self, scene: Scene, inputs: Float[Array, " inputs"], near: Near) -> Outcome:
         if not scene.coupled:  # a few steps of each section alone, from anywhere
             return self.solve(scene, inputs)
-        grid = self.grid(scene)
-        xi = near.model.strain_on(near.scene, near.forces, near.state, grid)
-        tension = tuple(-near.forces[place] for place in scene.length_driven)
-        turning = near.model.turning(near.scene, near.state, grid)
-        guess = lax.stop_gradient(ArmUnknown(xi, tension, turning))
-        return self._solve_together(scene, inputs, guess)
+        problem = problem_of(scene, inputs, self.grid(scene))
+        guess = near.model.unknowns_on(near.scene, near.forces, near.state, problem)
+        return self._solve_together(scene, problem, lax.stop_gradient(guess))
 
     def _solve_together(
-        self, scene: Scene, inputs: Float[Array, " inputs"], guess: ArmUnknown | None = None
+        self, scene: Scene, problem: ArmProblem, guess: ArmUnknown | None = None
     ) -> Outcome:
-        problem, kind = problem_of(scene, inputs, self.grid(scene))
-        unknown, balanced, definite, steps = solve_arm(problem, kind, guess)
-        tau = carried_forces(unknown, problem, kind)
+        unknown, balanced, definite, steps = solve_arm(problem, scene.free, guess)
+        tau = carried_forces(unknown, problem)
         status = classify(
             unknown.xi, problem.sections, tau, balanced, definite, loaded=bool(scene.loads)
         )
         sound = status == Status.CONVERGED
-        forces = forces_where(sound, with_tensions(problem.forces, unknown.tension, kind))
+        forces = forces_at(problem.couplings, unknown.coupled, problem.forces)
         xi = rest_where_failed(status, unknown.xi, problem.sections)
-        return Outcome(
-            ArmUnknown(xi, (), forces_where(sound, unknown.turning)), forces, status, steps
-        )
+        coupled = jax.tree.map(lambda x: jnp.where(sound, x, 0.0), unknown.coupled)
+        state = ArmSolution(xi, coupled, problem.couplings)
+        return Outcome(state, forces_where(sound, forces), status, steps)
 
-    def node_strain(self, scene: Scene, state: ArmUnknown) -> Vector:
+    def node_strain(self, scene: Scene, state: ArmSolution) -> Vector:
         return state.xi
 
-    def nodes(self, scene: Scene, forces: Forces, state: ArmUnknown) -> Nodes:
+    def nodes(self, scene: Scene, forces: Forces, state: ArmSolution) -> Nodes:
         grid = self.grid(scene)
         return Nodes(
             grid,
             state.xi,
             scene.sections(grid.X),
-            shares_at(scene, state.xi, state.turning, grid, grid.X),
+            state.shares_at(scene, grid, grid.X),
         )
 
-    def coordinates(self, scene: Scene, forces: Forces, state: ArmUnknown) -> Float[Array, " dofs"]:
+    def coordinates(
+        self, scene: Scene, forces: Forces, state: ArmSolution
+    ) -> Float[Array, " dofs"]:
         return jnp.array(forces, state.xi[0].dtype)
 
     def dofs(self, scene: Scene) -> int:
@@ -113,22 +113,26 @@ class StrainDependent(SteppedModel):
     def dof_labels(self, size: int) -> None:
         return None
 
-    def strain_on(self, scene: Scene, forces: Forces, state: ArmUnknown, grid: Grid) -> Vector:
+    def strain_on(self, scene: Scene, forces: Forces, state: ArmSolution, grid: Grid) -> Vector:
         if state.xi[0].shape == grid.X.shape:
             return state.xi
         return super().strain_on(scene, forces, state, grid)
 
-    def turning(self, scene: Scene, state: ArmUnknown, grid: Grid) -> Vector:
-        X = self.grid(scene).X.T.reshape(-1)
-        return tuple(jnp.interp(grid.X, X, x.T.reshape(-1)) for x in state.turning)
+    def unknowns_on(
+        self, scene: Scene, forces: Forces, state: ArmSolution, problem: ArmProblem
+    ) -> ArmUnknown:
+        X = self.grid(scene).X
+        pairs = zip(problem.couplings, state.coupled, strict=True)
+        coupled = tuple(coupling.moved(x, X, problem.grid) for coupling, x in pairs)
+        return ArmUnknown(self.strain_on(scene, forces, state, problem.grid), coupled)
 
     def strain(
-        self, scene: Scene, forces: Forces, state: ArmUnknown, X: Float[Array, " stations"]
+        self, scene: Scene, forces: Forces, state: ArmSolution, X: Float[Array, " stations"]
     ) -> Vector:
         grid = self.grid(scene)
         loads = loading(scene, grid)
         reaction = None if loads is None else react_at(state.xi, grid, loads, X)
-        tau = shared(forces, shares_at(scene, state.xi, state.turning, grid, X))
+        tau = shared(forces, state.shares_at(scene, grid, X))
         start = tuple(jnp.interp(X, grid.X.T.reshape(-1), x.T.reshape(-1)) for x in state.xi)
         sections = scene.sections(X)
         xi = solve_balance(sections, tau, reaction, scene.free, start).xi

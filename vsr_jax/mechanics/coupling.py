@@ -1,0 +1,221 @@
+r"""What ties the cross-sections of an arm together beside its loads: the interface that the solvers
+know, and the data of the coupled balance.
+
+A coupling has unknowns x of its own, with as many residual rows. It may change the forces of the
+threads, and it gives what Newton's method needs of it: a start, sizes of its unknowns and rows, and
+its part of the tangent system,
+
+$$\begin{pmatrix} A & P \\ F R & D \end{pmatrix}
+\begin{pmatrix} \delta\xi \\ \delta x \end{pmatrix} = \begin{pmatrix} r \\ s \end{pmatrix},$$
+
+a border of the system A of the strains. A coupling without a border has the tangent 1: Newton's
+method then repeats its rows from step to step.
+
+To add one, derive from `Coupling` and name it in `couplings_of`. All arrays of one arm have the
+arms of a batch in further axes at their end.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PyTree
+
+from ..arm.scene import CrossSections, Scene
+from ..numerics import component as c, lu
+from ..numerics.component import Forces, Vector
+from ..numerics.quadrature import Grid
+from .balance import without_force
+from .reaction import Loading, Reaction
+
+Shares = tuple[Array | None, ...]
+"""Share of each thread's force at the nodes; None for 1."""
+
+
+class ArmProblem(NamedTuple):
+    """Data of the coupled balance: `forces` of the threads at their start as the inputs give them,
+    and what couples the sections."""
+
+    grid: Grid
+    sections: CrossSections
+    forces: Forces
+    loads: Loading | None
+    couplings: tuple["Coupling", ...]
+
+    def with_share(self, share: Array) -> "ArmProblem":
+        """The problem with a fraction of its loads."""
+        return self if self.loads is None else self._replace(loads=self.loads.scaled(share))
+
+    def at_rest(self) -> "ArmProblem":
+        """The problem without loads and forces and with relaxed couplings, so that its solution is
+        the rest strain."""
+        return self._replace(
+            forces=without_force(self.forces),
+            loads=None if self.loads is None else self.loads.absent(),
+            couplings=tuple(coupling.relaxed() for coupling in self.couplings),
+        )
+
+    @property
+    def length(self) -> Array:
+        """Length of the arm [m]."""
+        return jnp.sum(self.grid.h, axis=0)
+
+
+class ArmState(NamedTuple):
+    """Quantities computed from the unknowns: the strain, the share of each thread's force at the
+    nodes, its force there, the reaction (None without loads), and what each coupling noted."""
+
+    xi: Vector
+    shares: Shares
+    tau: Forces
+    along: Reaction | None
+    notes: tuple[Any, ...]
+
+
+class Border(NamedTuple):
+    r"""Part of a coupling with m unknowns in the tangent system.
+
+    - `columns`: P, for each unknown the wrench at the nodes that it adds to the residual.
+    - `rows`: R, for each row a wrench at the nodes; its work over a change of strain, times the
+      factor, is the change of the row.
+    - `factors`: F, shape (m, ...). `corner`: the diagonal of D, shape (m, ...).
+    """
+
+    columns: tuple[Vector, ...]
+    rows: tuple[Vector, ...]
+    factors: Array
+    corner: Array
+
+
+class Coupling(eqx.Module):
+    """What ties cross-sections together. Its unknowns x are one array of shape (m, ...) or a tuple
+    of arrays, and its rows have the same shapes."""
+
+    follows_rate: ClassVar[bool] = False
+    """Whether the strain and its derivative along the arm give its unknowns."""
+
+    @abstractmethod
+    def relaxed(self) -> "Coupling":
+        """The coupling with the rest strain as its solution."""
+
+    @abstractmethod
+    def guess(self, forces: Forces, grid: Grid) -> PyTree:
+        """Unknowns that go with the forces of all threads at their start, to begin with."""
+
+    @abstractmethod
+    def residual(
+        self, x: PyTree, at: ArmState, note: Any, problem: ArmProblem, free: tuple[int, ...]
+    ) -> PyTree:
+        """Its rows, zero in equilibrium."""
+
+    @abstractmethod
+    def sizes(self, x: PyTree, at: ArmState, problem: ArmProblem) -> list[Array]:
+        """Dimensionless sizes of a change of its unknowns, by the shapes that they cause."""
+
+    @abstractmethod
+    def row_sizes(self, rows: PyTree, at: ArmState, problem: ArmProblem) -> list[Array]:
+        """Dimensionless sizes of its rows."""
+
+    @abstractmethod
+    def units(self, problem: ArmProblem) -> tuple[PyTree, PyTree]:
+        """Factors that scale its rows and its changes to square roots of energies: see
+        `tangent_solve`."""
+
+    @abstractmethod
+    def radians(self, problem: ArmProblem) -> PyTree:
+        """Factors that make its unknowns comparable to angles."""
+
+    def forces(self, x: PyTree, forces: Forces) -> Forces:
+        """Force of every thread at its start; unchanged by default."""
+        return forces
+
+    def shares(
+        self, x: PyTree, xi: Vector, sections: CrossSections, grid: Grid, shares: Shares
+    ) -> Shares:
+        """Share of each thread's force at the nodes; unchanged by default."""
+        return shares
+
+    def shares_at(
+        self, x: PyTree, xi: Vector, scene: Scene, grid: Grid, X: Array, shares: Shares
+    ) -> Shares:
+        """The same at abscissas X of any shape, from the strain at the nodes of a grid."""
+        return shares
+
+    def note(self, x: PyTree, at: ArmState, problem: ArmProblem) -> Any:
+        """What both its residual and its border need; nothing by default."""
+        return None
+
+    def border(self, x: PyTree, at: ArmState, note: Any, problem: ArmProblem) -> Border | None:
+        """Its part of the tangent system; none by default, for the tangent 1."""
+        return None
+
+    def from_rate(self, xi: Vector, rate: Vector, sections: CrossSections) -> PyTree:
+        r"""Its unknowns, where it `follows_rate`, from the strain and the derivative $(\xi -
+        \xi^*)'$ along the arm, which models with a basis know."""
+        raise NotImplementedError
+
+    def moved(self, x: PyTree, X: Array, grid: Grid) -> PyTree:
+        """Its unknowns on another grid than that with the nodes X; unchanged by default."""
+        return x
+
+
+def forces_at(couplings: tuple[Coupling, ...], unknowns: tuple, forces: Forces) -> Forces:
+    """Force of every thread at its start: as the inputs give it, or as a coupling does."""
+    for coupling, x in zip(couplings, unknowns, strict=True):
+        forces = coupling.forces(x, forces)
+    return forces
+
+
+def borders_of(
+    problem: ArmProblem, unknowns: tuple, at: ArmState
+) -> tuple[tuple[int, ...], Border | None]:
+    """Which couplings have a border, and all borders as one; None if there is none."""
+    each = [
+        coupling.border(x, at, note, problem)
+        for coupling, x, note in zip(problem.couplings, unknowns, at.notes, strict=True)
+    ]
+    found = [border for border in each if border is not None]
+    places = tuple(i for i, border in enumerate(each) if border is not None)
+    if not found:
+        return places, None
+    columns, rows, factors, corners = zip(*found, strict=True)
+    whole = Border(
+        sum(columns, ()), sum(rows, ()), jnp.concatenate(factors), jnp.concatenate(corners)
+    )
+    return places, whole
+
+
+def bordered_solve(
+    solve: Callable[[Vector], Vector], strain: Vector, right: Array, border: Border, grid: Grid
+) -> tuple[Vector, Array, Array]:
+    """Solution of a system with a border: the strain, the unknowns of the couplings, and the number
+    of negative pivots of the Schur complement.
+
+    Each negative pivot is an unstable motion of the arm alone that the couplings prevent: the arm
+    is stable if its tangent has no more negative eigenvalues than that.
+
+    **Arguments:** `solve`: of the system of the strains; `strain`: its solution for their right
+    side; `right`: that of the couplings, shape (m, ...).
+    """
+
+    def work(row: Vector, change: Vector) -> Array:
+        return jnp.sum(grid.weight * c.dot(row, change), axis=(-grid.X.ndim, 1 - grid.X.ndim))
+
+    answers = jax.vmap(solve)(jax.tree.map(lambda *v: jnp.stack(v), *border.columns))
+    size = len(border.rows)
+    given = jnp.stack([work(row, strain) for row in border.rows])
+    schur = [
+        (jnp.arange(size) == i).reshape(-1, *(1,) * (right.ndim - 1)) * border.corner[i]
+        - border.factors[i] * work(row, answers)
+        for i, row in enumerate(border.rows)
+    ]
+    factors = lu.factor(jnp.stack(schur))
+    x = lu.substitute(factors, right - border.factors * given)
+    strain = tuple(
+        a - jnp.sum(x[:, None, None] * answer, axis=0)
+        for a, answer in zip(strain, answers, strict=True)
+    )
+    return strain, x, jnp.sum(lu.diagonal(factors) < 0, axis=0, dtype=jnp.int32)
