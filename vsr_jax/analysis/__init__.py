@@ -14,6 +14,7 @@ from .derivatives import (
     sensitivity,
     tip_jacobian,
 )
+from .following import follow
 from .health import Health, check
 from .inverse import Reach, reach
 from .sweeping import Sweep, sweep
@@ -28,6 +29,7 @@ __all__ = [
     "check",
     "compliance",
     "compliance_ellipsoid",
+    "follow",
     "follow_branch",
     "manipulability",
     "reach",

@@ -17,7 +17,7 @@ from ..numerics.quadrature import Grid
 from ..numerics.stacked import components
 from .balance import free_components, residual
 from .cable import lengths_of
-from .coupling import ArmProblem, ArmState, Coupling, Shares, forces_at
+from .coupling import ArmProblem, ArmState, Carried, Coupling, Shares, forces_at
 from .friction import friction_of
 from .reaction import loading, react
 from .sizes import pull_of, shape_of, shape_size
@@ -44,11 +44,12 @@ class ArmSolution(NamedTuple):
     coupled: tuple[PyTree, ...]
     couplings: tuple[Coupling, ...]
 
-    def shares_at(self, scene: Scene, grid: Grid, X: Array) -> Shares:
-        """Share of each thread's force at abscissas X of any shape; `grid` is that of the nodes."""
+    def shares_at(self, scene: Scene, grid: Grid, X: Array, forces: Forces) -> Shares:
+        """Share of each thread's force at abscissas X of any shape; `grid` is that of the nodes,
+        `forces` are those at the start."""
         shares = scene.sections(X).reach
         for coupling, x in zip(self.couplings, self.coupled, strict=True):
-            shares = coupling.shares_at(x, self.xi, scene, grid, X, shares)
+            shares = coupling.shares_at(x, self.xi, scene, grid, X, forces, shares)
         return shares
 
 
@@ -69,26 +70,27 @@ def problem_of(scene: Scene, inputs: Array, grid: Grid) -> ArmProblem:
 def state_of(xi: Vector, coupled: tuple[PyTree, ...], problem: ArmProblem) -> ArmState:
     """Quantities computed from the unknowns."""
     grid, couplings = problem.grid, problem.couplings
-    shares = shares_of(xi, coupled, problem)
-    tau = shared(forces_at(couplings, coupled, problem.forces), shares)
+    forces = forces_at(couplings, coupled, problem.forces)
+    carried = _carried(xi, coupled, problem, forces)
     along = None if problem.loads is None else react(xi, grid, problem.loads)
-    at = ArmState(xi, shares, tau, along, ())
+    at = ArmState(xi, carried, shared(forces, carried.shares), along, ())
     pairs = zip(couplings, coupled, strict=True)
     return at._replace(notes=tuple(coupling.note(x, at, problem) for coupling, x in pairs))
 
 
-def shares_of(xi: Vector, coupled: tuple[PyTree, ...], problem: ArmProblem) -> Shares:
-    """Share of each thread's force at the nodes."""
-    shares = problem.sections.reach
+def _carried(
+    xi: Vector, coupled: tuple[PyTree, ...], problem: ArmProblem, forces: Forces
+) -> Carried:
+    carried = Carried(problem.sections.reach, problem.sections.reach)
     for coupling, x in zip(problem.couplings, coupled, strict=True):
-        shares = coupling.shares(x, xi, problem.sections, problem.grid, shares)
-    return shares
+        carried = coupling.carried(x, xi, problem, forces, carried)
+    return carried
 
 
 def carried_forces(unknown: ArmUnknown, problem: ArmProblem) -> Forces:
     """Force of each thread at the nodes."""
     forces = forces_at(problem.couplings, unknown.coupled, problem.forces)
-    return shared(forces, shares_of(unknown.xi, unknown.coupled, problem))
+    return shared(forces, _carried(*unknown, problem, forces).shares)
 
 
 def imbalance_of(

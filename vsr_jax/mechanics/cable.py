@@ -72,9 +72,9 @@ class Lengths(Coupling):
 
     def note(self, x: Array, at: ArmState, problem: ArmProblem) -> Vector:
         """Slack of each [m]."""
-        grid, sections = problem.grid, problem.sections
+        grid, sections, shares = problem.grid, problem.sections, at.carried.shares
         return tuple(
-            cable.slack(tension, path_length(at.xi, sections, place, grid), at.shares[place], grid)
+            cable.slack(tension, path_length(at.xi, sections, place, grid), shares[place], grid)
             for place, cable, tension in zip(self.places, self.cables, x, strict=True)
         )
 
@@ -86,7 +86,7 @@ class Lengths(Coupling):
         return jnp.stack([jnp.where(tension < slack, tension, slack) for tension, slack in pairs])
 
     def border(self, x: Array, at: ArmState, note: Vector, problem: ArmProblem) -> Border:
-        sections, grid = problem.sections, problem.grid
+        sections, grid, gains = problem.sections, problem.grid, at.carried.gains
         paths = [sections.paths[place] for place in self.places]
         wrenches = [thread_wrench(thread_direction(at.xi, path)[0], path) for path in paths]
         pairs = list(zip(self.places, wrenches, strict=True))
@@ -94,10 +94,10 @@ class Lengths(Coupling):
         for place, cable, tension, slack in zip(self.places, self.cables, x, note, strict=True):
             loose = tension < cable.scale * slack
             factors.append(jnp.where(loose, 0.0, -cable.scale))
-            stretch = cable.scale * cable.stretch(at.shares[place], grid)
+            stretch = cable.scale * cable.stretch(gains[place], grid)
             corner.append(jnp.where(loose, 1.0, stretch))
         return Border(
-            tuple(c.times(at.shares[place], wrench) for place, wrench in pairs),
+            tuple(c.times(gains[place], wrench) for place, wrench in pairs),
             tuple(c.times(sections.reach[place], wrench) for place, wrench in pairs),
             jnp.stack(factors),
             jnp.stack(corner),

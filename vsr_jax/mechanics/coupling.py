@@ -35,6 +35,14 @@ Shares = tuple[Array | None, ...]
 """Share of each thread's force at the nodes; None for 1."""
 
 
+class Carried(NamedTuple):
+    """Share of each thread's force at the nodes, and the change of the force there per change at
+    its start: the same where the shares do not depend on it."""
+
+    shares: Shares
+    gains: Shares
+
+
 class ArmProblem(NamedTuple):
     """Data of the coupled balance: `forces` of the threads at their start as the inputs give them,
     and what couples the sections."""
@@ -65,11 +73,11 @@ class ArmProblem(NamedTuple):
 
 
 class ArmState(NamedTuple):
-    """Quantities computed from the unknowns: the strain, the share of each thread's force at the
-    nodes, its force there, the reaction (None without loads), and what each coupling noted."""
+    """Quantities computed from the unknowns: the strain, what the threads carry, their forces at
+    the nodes, the reaction (None without loads), and what each coupling noted."""
 
     xi: Vector
-    shares: Shares
+    carried: Carried
     tau: Forces
     along: Reaction | None
     notes: tuple[Any, ...]
@@ -132,17 +140,34 @@ class Coupling(eqx.Module):
         """Force of every thread at its start; unchanged by default."""
         return forces
 
-    def shares(
-        self, x: PyTree, xi: Vector, sections: CrossSections, grid: Grid, shares: Shares
-    ) -> Shares:
-        """Share of each thread's force at the nodes; unchanged by default."""
-        return shares
+    def carried(
+        self, x: PyTree, xi: Vector, problem: ArmProblem, forces: Forces, carried: Carried
+    ) -> Carried:
+        """What the threads carry at the nodes, of their forces at the start; unchanged by
+        default."""
+        return carried
 
     def shares_at(
-        self, x: PyTree, xi: Vector, scene: Scene, grid: Grid, X: Array, shares: Shares
+        self,
+        x: PyTree,
+        xi: Vector,
+        scene: Scene,
+        grid: Grid,
+        X: Array,
+        forces: Forces,
+        shares: Shares,
     ) -> Shares:
-        """The same at abscissas X of any shape, from the strain at the nodes of a grid."""
+        """Share of each thread's force at abscissas X of any shape, from the strain at the nodes of
+        a grid; unchanged by default."""
         return shares
+
+    def after(self, x: PyTree, at: ArmState, problem: ArmProblem) -> "Coupling":
+        """The coupling with the memory of a solution before it; the same by default."""
+        return self
+
+    def remembering(self, other: "Coupling", X: Array, grid: Grid) -> "Coupling":
+        """The coupling with the memory of another one, at the nodes X; the same by default."""
+        return self
 
     def note(self, x: PyTree, at: ArmState, problem: ArmProblem) -> Any:
         """What both its residual and its border need; nothing by default."""
@@ -207,9 +232,9 @@ def bordered_solve(
     answers = jax.vmap(solve)(jax.tree.map(lambda *v: jnp.stack(v), *border.columns))
     size = len(border.rows)
     given = jnp.stack([work(row, strain) for row in border.rows])
+    unit = jnp.eye(size, dtype=right.dtype).reshape(size, size, *(1,) * (right.ndim - 1))
     schur = [
-        (jnp.arange(size) == i).reshape(-1, *(1,) * (right.ndim - 1)) * border.corner[i]
-        - border.factors[i] * work(row, answers)
+        unit[i] * border.corner[i] - border.factors[i] * work(row, answers)
         for i, row in enumerate(border.rows)
     ]
     factors = lu.factor(jnp.stack(schur))

@@ -1,6 +1,12 @@
 r"""Friction of tendons: the capstan equation $\tau' = \mp \mu \varphi' \tau$ with the turning rate
 $\varphi'$ of the tendon's path.
 
+After a change of direction a part of the cable sticks: its tension stays what it was, until the
+tension at the start has changed so much that it slips again. For a path of inputs (`after`) the
+tension at each section therefore is that before, raised or lowered to the nearer end of
+
+$$T e^{-\mu \varphi(X)} \le T(X) \le T e^{\mu \varphi(X)}.$$
+
 Where the strain jumps, at the end of another tendon or at a point force, or where the routing has a
 corner, the path has a kink of angle $\Delta\varphi$. Over a kink the tension changes by the factor
 $e^{\mp \mu \Delta\varphi}$.
@@ -10,7 +16,7 @@ derivative of the strain along the arm follows from the balance, $H \xi' = \Lamb
 \partial X + B_\tau \tau'$, without finite differences.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -24,8 +30,16 @@ from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import Grid, beyond, interpolation, locate, weighted, within
 from ..numerics.stacked import components
 from .balance import actuation_wrench, completed, free_block, free_components, residual, tangent
-from .coupling import ArmProblem, ArmState, Coupling, Shares
+from .coupling import ArmProblem, ArmState, Carried, Coupling, Shares
 from .sizes import node_weight, pull_of, softest
+
+
+class Memory(NamedTuple):
+    """Tension [N] of a cable at the nodes and its derivative along the arm [N/m], for the inputs
+    before the present ones."""
+
+    tension: Array
+    slope: Array
 
 
 class Friction(Coupling):
@@ -37,6 +51,7 @@ class Friction(Coupling):
     - `sections_rate`: $\partial / \partial X$ of the cross-sections at the nodes.
     - `breaks`: 1 for each step that starts at a breakpoint, where paths may have kinks; None if the
       arm has no breakpoints.
+    - `memory`: of each, where the arm follows a path of inputs; None without.
     """
 
     follows_rate = True
@@ -44,6 +59,7 @@ class Friction(Coupling):
     coefficients: Vector
     sections_rate: CrossSections
     breaks: Array | None
+    memory: tuple[Memory, ...] | None = None
 
     def relaxed(self) -> "Friction":
         return self
@@ -51,40 +67,102 @@ class Friction(Coupling):
     def guess(self, forces: Forces, grid: Grid) -> Vector:
         return (jnp.zeros_like(grid.X),) * len(self.places)
 
-    def shares(
-        self, x: Vector, xi: Vector, sections: CrossSections, grid: Grid, shares: Shares
-    ) -> Shares:
-        found = list(shares)
-        for place, turning, mu in zip(self.places, x, self.coefficients, strict=True):
+    def carried(
+        self, x: Vector, xi: Vector, problem: ArmProblem, forces: Forces, carried: Carried
+    ) -> Carried:
+        shares, gains = list(carried.shares), list(carried.gains)
+        sections, grid = problem.sections, problem.grid
+        for i, (place, turning, mu) in enumerate(
+            zip(self.places, x, self.coefficients, strict=True)
+        ):
             kinks = kinks_of(xi, sections, self.breaks, place, grid)
-            found[place] = share_left(found[place], turning, kinks, mu, grid)
-        return tuple(found)
+            angle = turned(c.times(sections.reach[place], turning), kinks, grid)
+            share, slips = self._share(i, mu * angle, -forces[place], None)
+            share = c.times(shares[place], share)
+            shares[place] = share
+            gains[place] = share if slips is None else slips * share
+        return Carried(tuple(shares), tuple(gains))
 
     def shares_at(
-        self, x: Vector, xi: Vector, scene: Scene, grid: Grid, X: Array, shares: Shares
+        self,
+        x: Vector,
+        xi: Vector,
+        scene: Scene,
+        grid: Grid,
+        X: Array,
+        forces: Forces,
+        shares: Shares,
     ) -> Shares:
         sections, found = scene.sections(grid.X), list(shares)
-        for place, rate, mu in zip(self.places, x, self.coefficients, strict=True):
+        for i, (place, rate, mu) in enumerate(zip(self.places, x, self.coefficients, strict=True)):
             reach, kinks = sections.reach[place], kinks_of(xi, sections, self.breaks, place, grid)
-            found[place] = c.times(
-                shares[place], decay_at(c.times(reach, rate), kinks, mu, grid, X)
-            )
+            angle = turned_at(c.times(reach, rate), kinks, grid, X)
+            share, _ = self._share(i, mu * angle, -forces[place], (grid.X, X))
+            found[place] = c.times(shares[place], share)
         return tuple(found)
+
+    def _share(
+        self, i: int, decay: Array, tension: Array, at: tuple[Array, Array] | None
+    ) -> tuple[Array, Array | None]:
+        """Share of the tension at the start, from the exponent of its decay, and 1 where the cable
+        slips, 0 where it sticks (None without memory); `at`: nodes and abscissas, if these are
+        not the nodes."""
+        least = jnp.exp(-decay)
+        if self.memory is None:
+            return least, None
+        before = self.memory[i].tension
+        if at is not None:
+            before = jnp.interp(at[1], *(value.T.reshape(-1) for value in (at[0], before)))
+        most = jnp.exp(decay)
+        sticks = (before > tension * least) & (before < tension * most)
+        kept = before / jnp.where(sticks, tension, 1.0)
+        slipping = jnp.where(before >= tension * most, most, least)
+        return jnp.where(sticks, kept, slipping), jnp.where(sticks, 0.0, 1.0)
+
+    def _slopes(self, x: Vector, at: ArmState) -> Vector:
+        r"""Derivatives $\tau'$ along the arm of the forces of all threads."""
+        slopes = [jnp.zeros_like(at.xi[0])] * len(at.tau)
+        for i, (place, turning, mu) in enumerate(
+            zip(self.places, x, self.coefficients, strict=True)
+        ):
+            slope = -mu * turning * at.tau[place]
+            if self.memory is not None:
+                share, gain = at.carried.shares[place], at.carried.gains[place]
+                assert share is not None
+                slope = jnp.where(share > 1.0, -slope, slope)
+                slope = jnp.where(gain == 0.0, -self.memory[i].slope, slope)
+            slopes[place] = slope
+        return tuple(slopes)
+
+    def after(self, x: Vector, at: ArmState, problem: ArmProblem) -> "Friction":
+        slopes = self._slopes(x, at)
+        memory = tuple(Memory(-at.tau[place], -slopes[place]) for place in self.places)
+        return self._with(memory)
+
+    def remembering(self, other: Coupling, X: Array, grid: Grid) -> "Friction":
+        assert isinstance(other, Friction)
+        if other.memory is None:
+            return self
+        nodes = X.T.reshape(-1)
+        return self._with(
+            jax.tree.map(lambda y: jnp.interp(grid.X, nodes, y.T.reshape(-1)), other.memory)
+        )
+
+    def _with(self, memory: tuple["Memory", ...]) -> "Friction":
+        coefficients = tuple(map(jnp.abs, self.coefficients))
+        return Friction(self.places, coefficients, self.sections_rate, self.breaks, memory)
 
     def residual(
         self, x: Vector, at: ArmState, note: None, problem: ArmProblem, free: tuple[int, ...]
     ) -> Vector:
         xi, sections = at.xi, problem.sections
-        slopes = [jnp.zeros_like(xi[0])] * len(at.tau)
-        for place, turning, mu in zip(self.places, x, self.coefficients, strict=True):
-            slopes[place] = -mu * turning * at.tau[place]
         change = None
         if at.along is not None:
             wrench, density = components(at.along.wrench), components(at.along.body_density)
             change = reaction_rate(xi, wrench, density)
         tau = tuple(jnp.broadcast_to(force, xi[0].shape) for force in at.tau)
         xi_rate = balanced_strain_rate(
-            xi, tau, tuple(slopes), change, sections, self.sections_rate, free
+            xi, tau, self._slopes(x, at), change, sections, self.sections_rate, free
         )
         return c.subtract(x, self._rates(xi, xi_rate, sections))
 
@@ -136,31 +214,21 @@ def _coefficient(scene: Scene, place: int) -> Array:
     return friction
 
 
-def decay(turning: Array, kinks: Array | None, coefficient: Array, grid: Grid) -> Array:
-    r"""Remaining share of the tension at the nodes, $e^{-\mu \varphi(X)}$, from the rates
-    $\varphi'$ there and the kinks before each step."""
+def turned(turning: Array, kinks: Array | None, grid: Grid) -> Array:
+    r"""Turning angle $\varphi(X)$ of a path from the base to the nodes, from the rates $\varphi'$
+    there and the kinks before each step."""
     angle = jnp.sum(grid.weight * turning, axis=(0, 1)) - beyond(turning[None], grid)[0]
-    return jnp.exp(-coefficient * (angle if kinks is None else angle + jnp.cumsum(kinks, axis=0)))
+    return angle if kinks is None else angle + jnp.cumsum(kinks, axis=0)
 
 
-def share_left(
-    reach: Array | None, turning: Array, kinks: Array | None, coefficient: Array, grid: Grid
-) -> Array:
-    """Share of a thread's force at the nodes, from its reach (None for the whole arm), its turning
-    rate and its kinks."""
-    return c.times(reach, decay(c.times(reach, turning), kinks, coefficient, grid))
-
-
-def decay_at(
-    turning: Array, kinks: Array | None, coefficient: Array, grid: Grid, X: Array
-) -> Array:
-    """`decay` at abscissas X."""
+def turned_at(turning: Array, kinks: Array | None, grid: Grid, X: Array) -> Array:
+    """`turned` at abscissas X."""
     step, sigma = locate(grid, X)
     through = jnp.cumsum(jnp.sum(grid.weight * turning, axis=0))
     before = jnp.append(jnp.zeros_like(through[:1]), through[:-1])
     if kinks is not None:
         before = before + jnp.cumsum(kinks)
-    return jnp.exp(-coefficient * (before[step] + within(turning[None], grid, step, sigma)[0]))
+    return before[step] + within(turning[None], grid, step, sigma)[0]
 
 
 def breaks_of(breakpoints: tuple[Array, ...], grid: Grid) -> Array | None:

@@ -160,6 +160,10 @@ class Model(eqx.Module):
         xi = self.strain(scene, forces, state, grid.X.reshape(-1))
         return tuple(x.reshape(grid.X.shape) for x in xi)
 
+    def problem_on(self, scene: Scene, inputs: Array, state: Any, grid: Grid) -> ArmProblem:
+        """The coupled balance on another grid, for the inputs of a solution."""
+        return problem_of(scene, inputs, grid)
+
     def unknowns_on(
         self, scene: Scene, forces: Forces, state: Any, problem: ArmProblem
     ) -> ArmUnknown:
@@ -258,7 +262,7 @@ class SteppedModel(Model):
     ) -> tuple[Vector, Vector]:
         """The strain on a grid, and that corrected there."""
         if scene.coupled:
-            problem = problem_of(scene, inputs, grid)
+            problem = self.problem_on(scene, inputs, state, grid)
             unknown = self.unknowns_on(scene, forces, state, problem)
             return unknown.xi, corrected_strain(problem, unknown, scene.free)
         xi = self.strain_on(scene, forces, state, grid)

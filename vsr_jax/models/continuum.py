@@ -147,7 +147,7 @@ class Continuum(Model):
             grid,
             xi,
             scene.sections(grid.X),
-            on_steps.shares_at(scene, grid, grid.X),
+            on_steps.shares_at(scene, grid, grid.X, forces),
         )
 
     def finer(self) -> "Continuum":

@@ -206,8 +206,8 @@ class Prescribed(SteppedModel):
             return Nodes(grid, xi, sections, sections.reach)
         problem = problem_of(scene, jnp.zeros(len(scene.actuators), grid.h.dtype), grid)
         basis, unknown = self._at_nodes(scene, problem), prescribed_loaded.start(state, problem)
-        shares = prescribed_loaded.state_of(unknown, basis, problem).shares
-        return Nodes(grid, xi, sections, shares)
+        carried = prescribed_loaded.state_of(unknown, basis, problem).carried
+        return Nodes(grid, xi, sections, carried.shares)
 
     def strain(
         self, scene: Scene, forces: Forces, state: Array, X: Float[Array, " stations"]

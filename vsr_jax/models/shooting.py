@@ -109,7 +109,7 @@ def integrate(
 
     def at(t: Array) -> tuple[Array, CrossSections, Vector]:
         x = start + h * (inside + (1 - 2 * inside) * t)
-        shares = guess.state.shares_at(scene, guess.grid, x)
+        shares = guess.state.shares_at(scene, guess.grid, x, guess.forces)
         return x, scene.sections(x), shared(guess.forces, shares)
 
     def field(t: Any, line: SegmentState, _: None) -> SegmentState:

@@ -5,6 +5,8 @@ Without loads each node is solved alone. With loads the reaction is part of the 
 and all nodes are solved together (see `arm_balance`).
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,7 +14,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..arm.scene import Scene, shared
-from ..mechanics.arm_balance import ArmSolution, ArmUnknown, carried_forces, problem_of
+from ..mechanics.arm_balance import ArmSolution, ArmUnknown, carried_forces, problem_of, state_of
 from ..mechanics.arm_solve import solve_arm
 from ..mechanics.balance import (
     forces_where,
@@ -22,8 +24,9 @@ from ..mechanics.balance import (
     solve_balance,
     spread,
     strain_norm,
+    without_force,
 )
-from ..mechanics.coupling import ArmProblem, forces_at
+from ..mechanics.coupling import ArmProblem, Coupling, forces_at
 from ..mechanics.reaction import loading, react_at
 from ..numerics.component import Forces, Vector
 from ..numerics.magnus import ORDERS
@@ -75,6 +78,42 @@ class StrainDependent(SteppedModel):
         guess = near.model.unknowns_on(near.scene, near.forces, near.state, problem)
         return self._solve_together(scene, problem, lax.stop_gradient(guess))
 
+    def solve_after(self, scene: Scene, inputs: Float[Array, " inputs"], near: Near) -> Outcome:
+        """As `solve_from`, on a path of inputs: the couplings remember the solution before, one by
+        this model of the same scene."""
+        if not scene.coupled:
+            return self.solve(scene, inputs)
+        problem = problem_of(scene, inputs, self.grid(scene))
+        couplings = tuple(
+            new.remembering(old, problem.grid.X, problem.grid)
+            for new, old in zip(problem.couplings, self.memory(near), strict=True)
+        )
+        guess = lax.stop_gradient(ArmUnknown(near.state.xi, near.state.coupled))
+        return self._solve_together(scene, problem._replace(couplings=couplings), guess)
+
+    def memory(self, near: Near) -> tuple[Coupling, ...]:
+        """The couplings of a solution by this model, with the memory of it."""
+        state, grid = near.state, self.grid(near.scene)
+        old = ArmProblem(
+            grid, near.scene.sections(grid.X), near.forces, None, state.couplings
+        )  # its loads do not count
+        at = state_of(state.xi, state.coupled, old)
+        return tuple(
+            coupling.after(x, at, old)
+            for coupling, x in zip(state.couplings, state.coupled, strict=True)
+        )
+
+    def at_rest(self, scene: Scene, dtype: Any) -> Near:
+        """The arm at rest, from which a path of inputs starts."""
+        zero = jnp.zeros(len(scene.actuators), dtype)
+        problem = problem_of(scene, zero, self.grid(scene))
+        forces = without_force(problem.forces)
+        xi = tuple(jnp.broadcast_to(x, problem.grid.X.shape) for x in problem.sections.rest)
+        if not scene.coupled:
+            return Near(self, scene, forces, ArmSolution(xi, (), ()))
+        coupled = tuple(coupling.guess(forces, problem.grid) for coupling in problem.couplings)
+        return Near(self, scene, forces, ArmSolution(xi, coupled, problem.couplings))
+
     def _solve_together(
         self, scene: Scene, problem: ArmProblem, guess: ArmUnknown | None = None
     ) -> Outcome:
@@ -99,7 +138,7 @@ class StrainDependent(SteppedModel):
             grid,
             state.xi,
             scene.sections(grid.X),
-            state.shares_at(scene, grid, grid.X),
+            state.shares_at(scene, grid, grid.X, forces),
         )
 
     def coordinates(
@@ -118,6 +157,14 @@ class StrainDependent(SteppedModel):
             return state.xi
         return super().strain_on(scene, forces, state, grid)
 
+    def problem_on(self, scene: Scene, inputs: Array, state: ArmSolution, grid: Grid) -> ArmProblem:
+        problem, X = super().problem_on(scene, inputs, state, grid), self.grid(scene).X
+        couplings = tuple(
+            new.remembering(old, X, grid)
+            for new, old in zip(problem.couplings, state.couplings, strict=True)
+        )
+        return problem._replace(couplings=couplings)
+
     def unknowns_on(
         self, scene: Scene, forces: Forces, state: ArmSolution, problem: ArmProblem
     ) -> ArmUnknown:
@@ -132,7 +179,7 @@ class StrainDependent(SteppedModel):
         grid = self.grid(scene)
         loads = loading(scene, grid)
         reaction = None if loads is None else react_at(state.xi, grid, loads, X)
-        tau = shared(forces, state.shares_at(scene, grid, X))
+        tau = shared(forces, state.shares_at(scene, grid, X, forces))
         start = tuple(jnp.interp(X, grid.X.T.reshape(-1), x.T.reshape(-1)) for x in state.xi)
         sections = scene.sections(X)
         xi = solve_balance(sections, tau, reaction, scene.free, start).xi

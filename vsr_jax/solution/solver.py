@@ -1,5 +1,7 @@
 """`solve`: the equilibrium of a scene under its inputs."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
@@ -119,10 +121,24 @@ def outcome_of(
 ) -> Outcome:
     """Outcome of a model, started from a solution near by if one is given; all arguments have one
     precision. NaN and inputs that an actuator cannot exert get their own status."""
+
+    def solver(scene: Scene, values: Array) -> Outcome:
+        return model.solve(scene, values) if near is None else model.solve_from(scene, values, near)
+
+    return checked_outcome(scene, inputs, model, solver)
+
+
+def checked_outcome(
+    scene: Scene,
+    inputs: Float[Array, " inputs"],
+    model: Model,
+    solver: Callable[[Scene, Array], Outcome],
+) -> Outcome:
+    """Outcome of a solver for admissible inputs, with the status of others and of steps that do not
+    resolve the shape."""
     finite, admitted = jnp.all(jnp.isfinite(inputs)), scene.admits(inputs)
     values = jnp.where(finite & admitted, inputs, 0.0)
-    outcome = model.solve(scene, values) if near is None else model.solve_from(scene, values, near)
-    outcome = resolved(model, scene, outcome)
+    outcome = resolved(model, scene, solver(scene, values))
     return outcome._replace(status=admitted_status(outcome.status, scene, inputs))
 
 

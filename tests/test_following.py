@@ -1,0 +1,196 @@
+"""Paths of inputs: the hysteresis of friction against an independent integration along the cable,
+and paths without friction."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vsr_jax as vsr
+from vsr_jax.arm.scene_numbers import replaced
+
+MODEL = vsr.StrainDependent(12)
+LENGTH, MU = 0.3, 0.3
+UP_AND_DOWN = np.concatenate([np.linspace(0, 6, 4), np.linspace(5, 0.5, 6), np.linspace(2, 6, 3)])
+
+
+def stiff_sheath(name):
+    """An arm that keeps its rest shape under these tensions, straight and then bent, or with a
+    helical tendon; and the turning angle of the tendon's path over X."""
+    material = vsr.Material(1e14, poisson=0.3)
+    if name == "helix":
+        radius, angle = 0.006, 1.2
+        routing, curvature = vsr.Helix(radius, angle), None
+        rate = np.cos(angle) ** 2 / radius / np.sin(angle)  # curvature times arc length over X
+
+        def turned(X):
+            return rate * X
+    else:
+        routing = vsr.Parallel(0.004, 0.0)
+        curvature = vsr.Piecewise((0.1,), (0.0, 15.0))
+
+        def turned(X):
+            return 15.0 * np.maximum(X - 0.1, 0.0)
+
+    rest = None if curvature is None else (0.0, 0.0, curvature, 1.0, 0.0, 0.0)
+    rod = vsr.Rod(LENGTH, vsr.Circular(0.01), material, rest_strain=rest)
+    return vsr.Scene(rod, [vsr.Tendon(routing, friction=MU)]), turned
+
+
+def pulled_in_small_steps(tensions, angle):
+    """Tension along a cable in a rigid sheath, by a chain of short pieces: each piece slips where
+    the ratio of the tensions at its ends would leave the cone of friction, else keeps its own."""
+    along, history = np.zeros(angle.size), []
+    cone = np.exp(MU * np.diff(angle, prepend=0.0))
+    for tension in tensions:
+        before = tension
+        for i, ratio in enumerate(cone):
+            before = along[i] = np.clip(along[i], before / ratio, before * ratio)
+        history.append(along.copy())
+    return np.array(history)
+
+
+@pytest.mark.parametrize("name", ["straight, then bent", "helix"])
+def test_tensions_in_a_rigid_sheath(name):
+    scene, turned = stiff_sheath(name)
+    path = vsr.follow(scene, UP_AND_DOWN[:, None], model=MODEL)
+    assert np.all(path.status == 0)
+    tension = -jax.vmap(lambda eq: eq.nodes.tau(eq.sound_forces)[0])(path)
+    X = np.asarray(MODEL.grid(scene).X)
+    order = np.argsort(X.ravel())
+    expected = pulled_in_small_steps(UP_AND_DOWN, turned(X.ravel()[order]))
+    found = np.asarray(tension).reshape(len(UP_AND_DOWN), -1)[:, order]
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    stuck = (np.abs(np.diff(expected, axis=0)) < 1e-12) & (expected[1:] > 0)
+    assert stuck.any(), "no part of the cable sticks: the test shows nothing"
+
+
+def soft(**options):
+    rod = vsr.Rod(LENGTH, vsr.Circular(0.01), vsr.Material(6e5, poisson=0.45, density=300.0))
+    loads = options.pop("loads", ())
+    return vsr.Scene(rod, [vsr.Tendon(vsr.Helix(0.005, 1.5), friction=0.2, **options)], loads)
+
+
+def tips(scene, tensions, **options):
+    path = vsr.follow(scene, jnp.asarray(tensions)[:, None], model=MODEL, **options)
+    assert np.all(path.status == 0)
+    return jax.vmap(lambda eq: eq.tip[:3, 3])(path)
+
+
+def test_a_closed_cycle_returns_to_its_turning_point():
+    """The hysteresis of a play operator: inner loops close, and the outer one ends where the first
+    pull ended."""
+    found = tips(soft(), [2.0, 4.0, 3.0, 4.0, 6.0, 3.5, 4.0, 6.0])
+    pulled = [vsr.solve(soft(), [t], model=MODEL).tip[:3, 3] for t in (2.0, 4.0, 6.0)]
+    for place, expected in zip((0, 1, 3, 4, 7), np.array(pulled)[[0, 1, 1, 2, 2]], strict=True):
+        np.testing.assert_allclose(found[place], expected, atol=1e-9)
+    assert np.linalg.norm(found[6] - pulled[1]) > 1e-3  # on the way back up, within the loop
+
+
+def test_far_from_a_reversal_it_is_the_law_of_releasing():
+    found = tips(soft(), [8.0, 1.0])[-1]
+    released = vsr.solve(soft(motion="release"), [1.0], model=MODEL)
+    np.testing.assert_allclose(found, released.tip[:3, 3], atol=1e-9)
+
+
+def test_a_path_continues_in_parts():
+    scene = soft(loads=[vsr.Gravity((0.0, 0.0, -2.0))])
+    tensions = [1.0, 5.0, 3.0, 2.0, 4.0]
+    whole = tips(scene, tensions)
+    first = vsr.follow(scene, np.array(tensions[:3])[:, None], model=MODEL)
+    last = jax.tree.map(lambda x: x[-1], first)
+    np.testing.assert_allclose(tips(scene, tensions[3:], start=last), whole[3:], atol=1e-9)
+
+
+def test_gradients_by_the_past_and_by_the_friction():
+    """Of a sample whose cable partly sticks: against differences, in both modes."""
+    scene = soft()
+
+    def height(tensions, mu):
+        one = replaced(scene, {"actuators[0].friction": mu})
+        path = vsr.follow(one, tensions[:, None], model=MODEL)
+        return jax.vmap(lambda eq: eq.tip[2, 3])(path)[-1]
+
+    at = jnp.array([2.0, 6.0, 5.2]), jnp.array(0.2)
+    backward = jax.grad(height, argnums=(0, 1))(*at)
+    ways = [(jnp.eye(3)[i], jnp.zeros(())) for i in range(3)] + [(jnp.zeros(3), jnp.ones(()))]
+    run = jax.jit(height)
+    for way, found in zip(ways, [*backward[0], backward[1]], strict=True):
+        forward = jax.jvp(height, at, way)[1]
+        np.testing.assert_allclose(forward, found, atol=1e-10)
+        ends = [run(*jax.tree.map(lambda x, w, s=s: x + s * w, at, way)) for s in (1e-5, -1e-5)]
+        np.testing.assert_allclose(found, (ends[0] - ends[1]) / 2e-5, atol=3e-7)
+    assert abs(float(backward[0][1])) > 1e-4  # the past counts
+    assert abs(float(backward[0][0])) < 1e-12  # except where it was overrun
+
+
+def test_lengths_with_friction():
+    """Cable paid out and taken in again: the tension at the motor is lower on the way out."""
+    scene = soft(control="length")
+    path = vsr.follow(scene, jnp.array([-0.004, -0.010, -0.008, -0.006, -0.010])[:, None])
+    assert np.all(path.status == 0)
+    tension = -jax.vmap(lambda eq: eq.forces[0])(path)
+    pulled = vsr.solve(scene, [-0.008])
+    assert float(tension[2]) < -float(pulled.forces[0])
+    np.testing.assert_allclose(tension[4], tension[1], rtol=1e-8)
+
+
+def test_paths_batch_and_in_single_precision():
+    scene = soft()
+    paths = jnp.array([[1.0, 4.0, 2.0], [3.0, 1.0, 2.0]])[..., None]
+    both = jax.vmap(lambda u: vsr.follow(scene, u, model=MODEL).status)(paths)
+    assert np.all(both == 0)
+    ends = [
+        jax.vmap(
+            lambda u: jax.vmap(lambda eq: eq.tip[:3, 3])(vsr.follow(scene, u, model=MODEL))[-1]
+        )(paths.astype(dtype))
+        for dtype in ("float32", "float64")
+    ]
+    assert ends[0].dtype == jnp.float32
+    np.testing.assert_allclose(*ends, atol=2e-6)
+    np.testing.assert_allclose(ends[1][0], tips(scene, [1.0, 4.0, 2.0])[-1], atol=1e-9)
+
+
+def test_without_friction_the_arm_stays_in_its_equilibrium():
+    """A soft column in gravity, bent to one side and let go, hangs over that side: the same inputs,
+    two equilibria."""
+    rod = vsr.Rod(0.3, vsr.Elliptic(0.006, 0.009), vsr.Material(3e5, poisson=0.45, density=1000.0))
+    tendons = [vsr.Tendon(vsr.Parallel(y, 0.0)) for y in (0.004, -0.004)]
+    scene = vsr.Scene(rod, tendons, [vsr.Gravity((-9.81, 0.0, 0.0))])
+    path = jnp.array([[1.0, 0.0], [0.3, 0.0], [0.0, 0.0]])
+    ends = []
+    for inputs in (path, path[:, ::-1]):
+        found = vsr.follow(scene, inputs, model=MODEL)
+        assert np.all(found.status == 0)
+        ends.append(jax.vmap(lambda eq: eq.tip[:3, 3])(found)[-1])
+    np.testing.assert_allclose(ends[0], ends[1] * jnp.array([1.0, -1.0, 1.0]), atol=1e-8)
+    assert abs(float(ends[0][1])) > 0.05
+
+
+def test_a_sample_that_fails_is_passed_over():
+    scene = soft()
+    path = vsr.follow(scene, jnp.array([2.0, -1.0, 5.0, jnp.nan, 3.0])[:, None], model=MODEL)
+    np.testing.assert_array_equal(
+        path.status,
+        [0, vsr.Status.INADMISSIBLE, 0, vsr.Status.NOT_FINITE, 0],
+    )
+    found = jax.vmap(lambda eq: eq.tip[:3, 3])(path)
+    np.testing.assert_allclose(found[::2], tips(scene, [2.0, 5.0, 3.0]), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"inputs": [1.0, 2.0]}, r"inputs: got shape \(2,\), need \(samples, 1\)"),
+        ({"inputs": np.zeros((0, 1))}, "inputs: got shape"),
+    ],
+)
+def test_what_is_wrong_is_said(options, message):
+    with pytest.raises(ValueError, match=message):
+        vsr.follow(soft(), **{"inputs": [[1.0]], **options})
+
+
+def test_a_start_of_another_model_is_refused():
+    start = vsr.solve(soft(), [1.0], model=vsr.StrainDependent(8))
+    with pytest.raises(ValueError, match="start: got an equilibrium by StrainDependent"):
+        vsr.follow(soft(), [[1.0]], model=MODEL, start=start)

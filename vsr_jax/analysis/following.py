@@ -1,0 +1,120 @@
+r"""`follow`: equilibria along a path of inputs, each from the one before it.
+
+The path is quasi-static: the arm is in equilibrium at every sample. Each solve starts from the
+equilibrium before, so that of several stable equilibria the arm stays in its own until that one
+disappears. Tendons with friction remember their tension at every section,
+
+$$T_j(X) = \min(\max(T_{j-1}(X), T_j e^{-\mu \varphi(X)}), T_j e^{\mu \varphi(X)}),$$
+
+with $T_j$ the tension at the start and $\varphi$ the turning angle of the path: where the old
+tension lies between both envelopes the cable sticks, elsewhere it slips.
+
+**Source:** for a cable in a sheath of fixed shape, M. Kaneko, T. Yamashita and K. Tanie, Basic
+considerations on transmission characteristics for tendon drive robots, ICAR 1991.
+"""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.typing import ArrayLike
+from jaxtyping import Array
+
+from ..arm.scene import Scene
+from ..models.base import Near, Outcome, Status
+from ..models.strain_dependent import StrainDependent
+from ..solution.equilibrium import Equilibrium
+from ..solution.solver import checked_outcome
+from ..typing import cast
+from ..validation import instance, numbers
+
+
+def follow(
+    scene: Scene,
+    inputs: ArrayLike | Sequence,
+    *,
+    model: StrainDependent | None = None,
+    start: Equilibrium | None = None,
+) -> Equilibrium:
+    r"""Equilibria along a path of inputs, in order, with the history of the tendons' friction.
+
+    Where a tendon has friction its tension follows $T_j(X) = \min(\max(T_{j-1}(X), T_j e^{-\mu
+    \varphi(X)}), T_j e^{\mu \varphi(X)})$ from one sample to the next: after a reversal it slips
+    from its start on, and sticks beyond with the tension that it had. The `motion` of the tendons
+    is not used; pulling from rest follows the law of `"pull"`, releasing far enough that of
+    `"release"`. A part that sticks keeps its tension also where loads deform the arm there.
+
+    Without friction the equilibria are those of `solve(start=)`: of several stable ones the arm
+    stays in the one that it is in.
+
+    **Arguments:**
+    - `scene`: one scene for the whole path.
+    - `inputs`: shape (samples, actuators), in order. Their dtype is the precision.
+    - `model`: a `StrainDependent`, the default.
+    - `start`: where the path begins: an equilibrium of the same scene and model, for example the
+      last one of another path, which the two then continue; by default the arm at rest, with all
+      cables free of tension.
+
+    **Returns:** an `Equilibrium` with a batch axis of that size, for use with `jax.vmap`, as in
+    `jax.vmap(lambda eq: eq.tip)(path)`; `jax.tree.map(lambda x: x[-1], path)` is the last one. A
+    sample without an equilibrium has a status as of `solve`; the next one continues from the last
+    that has one. Differentiable with respect to the inputs, the scene and `start`.
+
+    **Raises:** `ValueError` for inputs of a wrong shape, another model, and a start of another
+    model or with other actuators.
+    """
+    instance("scene", scene, Scene, "a Scene")
+    model = StrainDependent() if model is None else model
+    instance("model", model, StrainDependent, "a StrainDependent, the only model with a memory")
+    values = _path(scene, inputs)
+    scene = cast(scene, values.dtype)
+    before = model.at_rest(scene, values.dtype) if start is None else _start(start, scene, model)
+    outcomes = _follow(scene, cast(before, values.dtype), values)
+    return jax.vmap(lambda u, outcome: Equilibrium(scene, u, model, outcome))(values, outcomes)
+
+
+def _path(scene: Scene, inputs: ArrayLike | Sequence) -> Array:
+    values = numbers("inputs", inputs, None, finite=False)
+    if values.ndim != 2 or values.shape[1] != len(scene.actuators) or not len(values):
+        raise ValueError(
+            f"inputs: got shape {values.shape}, need (samples, {len(scene.actuators)}), one row "
+            f"per sample"
+        )
+    return values
+
+
+def _start(start: Equilibrium, scene: Scene, model: StrainDependent) -> Near:
+    instance("start", start, Equilibrium, "an Equilibrium, the result of another solve")
+    start.refuse_batch()
+    kinds = [
+        [type(actuator).__name__ for actuator in one.actuators] for one in (start.scene, scene)
+    ]
+    same = start.model == model and start.scene.frictional == scene.frictional
+    if not same or kinds[0] != kinds[1] or start.scene.length_driven != scene.length_driven:
+        raise ValueError(
+            f"start: got an equilibrium by {start.model} of a scene with other actuators or "
+            f"another model, need one of the same scene by {model}"
+        )
+    return Near(model, scene, start.sound_forces, start.state)
+
+
+@eqx.filter_jit
+def _follow(scene: Scene, before: Near, inputs: Array) -> Outcome:
+    model = before.model
+    assert isinstance(model, StrainDependent)
+
+    def proceed(carry: tuple, values: Array) -> tuple[tuple, Outcome]:
+        near = Near(model, scene, *carry)
+        outcome = checked_outcome(
+            scene, values, model, lambda scene, u: model.solve_after(scene, u, near)
+        )
+        found = outcome.status == Status.CONVERGED
+        after = (outcome.forces, outcome.state)
+        return jax.tree.map(lambda a, b: jnp.where(found, a, b), after, carry), outcome
+
+    state = before.state
+    if scene.coupled:  # with memories, as all states on the path have them
+        state = state._replace(couplings=model.memory(before))
+    return lax.scan(proceed, (before.forces, state), inputs)[1]
