@@ -1,7 +1,7 @@
-"""Size of the programs of bare and loaded arms, time to trace and to compile them, time of a solve,
-and Newton steps of random loaded arms; of two checkouts in one run.
+"""Size of the programs of bare and loaded arms, time to trace and to compile them, and time of a
+solve; of two checkouts in one run.
 
-    python benchmarks/bench_compile.py [--against DIR] [--rounds N] [--draws N] [--json FILE]
+    python benchmarks/bench_compile.py [--against DIR] [--rounds N] [--json FILE]
 
 Each measurement is made in a process of its own, so that nothing is compiled already. With
 `--against` another checkout of the package is measured in turn with this one, and the last column
@@ -25,7 +25,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from ordinary_scenes import STRUCTURES, built, plain
 
 import vsr_jax as vsr
 from vsr_jax.studies import paper
@@ -91,29 +90,6 @@ def program(name: str, kind: str) -> dict[str, float]:
     }
 
 
-def newton_steps(name: str, draws: int) -> dict[str, float]:
-    """Evaluations of the loaded solve over random draws of a structure."""
-    structure, random = STRUCTURES[name], np.random.default_rng(0)
-    drawn = [plain(structure.numbers(random)) for _ in range(draws)]
-    numbers = {key: jnp.array([one[key] for one in drawn]) for key in drawn[0]}
-
-    def solved(one: Any) -> tuple[jax.Array, jax.Array]:
-        eq = vsr.solve(*built(structure, one), model=vsr.StrainDependent(STEPS))
-        return eq.converged, eq.steps
-
-    converged, steps = (np.asarray(x) for x in jax.jit(jax.vmap(solved))(numbers))
-    found = steps[converged]
-    low, middle, high = np.percentile(found, (10, 50, 90))
-    return {
-        "converged": float(converged.mean()),
-        "mean": float(found.mean()),
-        "10%": float(low),
-        "median": float(middle),
-        "90%": float(high),
-        "most": float(found.max()),
-    }
-
-
 def measured(checkout: Path, *arguments: str) -> dict[str, float]:
     """One measurement in a process of its own that imports the package from a checkout."""
     environment = os.environ | {"PYTHONPATH": str(checkout), "VSR_JAX_CACHE": "off"}
@@ -126,11 +102,10 @@ def compare(options: argparse.Namespace) -> list[dict[str, Any]]:
     """All measurements, in turn between the checkouts."""
     checkouts = {"this": HERE} | ({"other": options.against} if options.against else {})
     jobs = [(name, kind) for name in scenes() for kind in ("one", "batch", "gradient")]
-    jobs += [(name, str(options.draws)) for name in STRUCTURES if options.draws]
     rows = []
     for name, kind in jobs:
         taken: dict[str, list[dict[str, float]]] = {side: [] for side in checkouts}
-        for _ in range(1 if kind.isdigit() else options.rounds):
+        for _ in range(options.rounds):
             for side, checkout in checkouts.items():
                 taken[side].append(measured(checkout, name, kind))
         for key in taken["this"][0]:
@@ -153,18 +128,12 @@ def main() -> None:
     )
     parser.add_argument("--against", type=Path, metavar="DIR", help="another checkout")
     parser.add_argument("--rounds", type=int, default=3, help="processes per program (default: 3)")
-    parser.add_argument(
-        "--draws", type=int, default=100, help="arms per structure (default: 100; 0: none)"
-    )
     parser.add_argument("--json", metavar="FILE", help="save the figures")
     parser.add_argument("--measure", nargs=2, help=argparse.SUPPRESS)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     if options.measure:
-        name, kind = options.measure
-        drawn = kind.isdigit()
-        one = newton_steps(name, int(kind)) if drawn else program(name, kind)
-        print(json.dumps(one))
+        print(json.dumps(program(*options.measure)))
         return
     rows = compare(options)
     if options.json:
