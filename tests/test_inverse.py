@@ -91,6 +91,39 @@ def test_least_effort_leaves_one_of_two_antagonists_slack():
     np.testing.assert_allclose(found.inputs, [5.0, 0.0], atol=1e-6)
 
 
+def test_a_moving_target_is_followed_with_the_least_change_of_inputs():
+    """Four tendons, one more than needed: along the direction that keeps the tip nothing moves."""
+    rod = vsr.Rod(0.3, vsr.Circular(0.01), vsr.Material(8e5, poisson=0.45, density=800.0))
+    around = [
+        vsr.Tendon(vsr.Parallel(0.007 * np.cos(a), 0.007 * np.sin(a)))
+        for a in 0.3 + np.pi / 2 * np.arange(4)
+    ]
+    scene, model = vsr.Scene(rod, around, [vsr.Gravity()]), vsr.StrainDependent(8)
+    tense = jnp.array([4.0, 2.5, 2.0, 3.0])
+    eq = vsr.solve(scene, tense, model=model)
+    zero = jnp.zeros(())
+    here = vsr.Reach(tense, eq, zero, jnp.array(True), zero)
+    target = eq.tip[:3, 3] + jnp.array([0.0, 1e-3, 2e-3])
+    track = jax.jit(lambda t, start: vsr.reach(scene, t, (0.0, 8.0), model=model, start=start))
+    found = track(target, here)
+    assert bool(found.reached)
+    assert float(found.miss) < 1e-9
+    change = np.asarray(found.inputs - tense)
+    assert 0 < np.max(np.abs(change)) < 0.6
+    J = jax.jacfwd(lambda u: vsr.solve(scene, u, model=model).tip[:3, 3])(found.inputs)
+    keeps = np.linalg.svd(J)[2][3]
+    assert abs(keeps @ change) < 0.02 * np.linalg.norm(change)
+    at = track(target + jnp.array([0.0, 1e-3, 0.0]), found)
+    assert bool(at.reached)
+
+
+def test_a_start_with_other_actuators_is_refused(scene, reached):
+    eq = vsr.solve(vsr.Scene(scene.rod, []), [])
+    start = vsr.Reach(jnp.zeros(0), eq, jnp.zeros(()), jnp.array(True), jnp.zeros(()))
+    with pytest.raises(ValueError, match="start: got inputs of shape"):
+        vsr.reach(scene, jnp.zeros(3), (0.0, 1.0), start=start)
+
+
 @pytest.mark.slow
 def test_a_pose_and_points_along_the_arm(scene):
     inputs, X = jnp.array([7.0, 2.0, 4.0]), jnp.array([0.4, 0.75])

@@ -6,6 +6,7 @@ u = u_0 + (u_1 - u_0) s, \quad 0 \le s_i \le 1$
 for a weight w that decreases to zero (`bounded_least_squares`). $s_0$ is the share at which an
 input is closest to zero, so the second sum selects the least effort among many solutions. The first
 start is the nearest of 512 random inputs; further starts follow if it does not reach the target.
+From a result for a target near by $s_0$ and the only start are its inputs.
 Derivatives are those of the optimality condition.
 """
 
@@ -86,6 +87,7 @@ def reach(
     X: ArrayLike | Sequence | None = None,
     model: Model | None = None,
     allowed_miss: float | None = None,
+    start: Reach | None = None,
 ) -> Reach:
     """Inputs within bounds that bring the arm to a target, with the least effort among all that do.
 
@@ -102,12 +104,16 @@ def reach(
     - `allowed_miss` [m]: largest miss that counts as reached; by default 1e-4 of the length, in
       single precision 1e-3. It only affects `reached`; the inputs are those of the nearest point in
       any case.
+    - `start`: the result for a target near by, as in a control loop. The inputs then change as
+      little as they can, in place of the least effort; no other start is tried, and each solve
+      begins with the equilibrium of the start and stays in its branch. No derivative is taken with
+      respect to it.
 
     **Returns:** a `Reach`.
 
     **Raises:** `ValueError` for wrong shapes, a pose that is not a rigid transform, points beyond
-    the arm, bounds that contradict each other or an actuator's range, and a scene without
-    actuators.
+    the arm, bounds that contradict each other or an actuator's range, a scene without actuators,
+    and a start with other actuators.
     """
     instance("scene", scene, Scene, "a Scene")
     aim = numbers("target", target, None)
@@ -121,11 +127,13 @@ def reach(
         if allowed_miss is None
         else jnp.asarray(positive("allowed_miss", allowed_miss), aim.dtype)
     )
-    return _reach(_ReachProblem(scene, aim, stations, low, high, model), allowed)
+    if start is not None:
+        start = lax.stop_gradient(cast(_check_start(start, low), aim.dtype))
+    return _reach(_ReachProblem(scene, aim, stations, low, high, model, start), allowed)
 
 
 class _ReachProblem(NamedTuple):
-    """Target, bounds and model; `X` is None for the tip."""
+    """Target, bounds and model; `X` is None for the tip; `start`, a result near by, if any."""
 
     scene: Scene
     target: Array
@@ -133,6 +141,7 @@ class _ReachProblem(NamedTuple):
     low: Array
     high: Array
     model: Model | None
+    start: Reach | None
 
     def inputs(self, share: Array) -> Array:
         """Inputs at shares of the range between their bounds."""
@@ -140,13 +149,15 @@ class _ReachProblem(NamedTuple):
 
     @property
     def idle(self) -> Array:
-        """Share at which each input is closest to zero."""
+        """Share at which each input is closest to zero, or to that of the start."""
         span = jnp.where(self.high > self.low, self.high - self.low, 1.0)
-        return (jnp.clip(jnp.zeros_like(self.low), self.low, self.high) - self.low) / span
+        rest = jnp.zeros_like(self.low) if self.start is None else self.start.inputs
+        return (jnp.clip(rest, self.low, self.high) - self.low) / span
 
     def at(self, share: Array) -> Equilibrium:
         """Equilibrium for inputs at shares of the range."""
-        return solve(self.scene, self.inputs(share), model=self.model)
+        near = None if self.start is None else self.start.equilibrium
+        return solve(self.scene, self.inputs(share), model=self.model, start=near)
 
     def places(self, eq: Equilibrium) -> Array:
         """What the target prescribes: pose of the tip, its position, or positions of the points."""
@@ -196,20 +207,23 @@ def _check_bounds(
     return low.astype(dtype), high.astype(dtype)
 
 
+def _check_start(start: Reach, low: Array) -> Reach:
+    instance("start", start, Reach, "a Reach, the result for another target")
+    if start.inputs.shape != low.shape:
+        raise ValueError(
+            f"start: got inputs of shape {start.inputs.shape}, need {low.shape}, one per actuator; "
+            f"use jax.vmap for a batch"
+        )
+    return start
+
+
 @eqx.filter_jit
 def _reach(problem: _ReachProblem, allowed: Scalar) -> Reach:
-    tried = jnp.asarray(
-        np.random.default_rng(0).uniform(size=(_SAMPLES, problem.low.size)), problem.low.dtype
-    )
-    tried = jnp.concatenate([problem.idle[None], tried])
-    places = jax.vmap(lambda share: problem.places(problem.at(share)))(
-        tried
-    )  # independent of the target: under vmap over targets solved once
-    distance = jax.vmap(lambda x: jnp.linalg.norm(problem.misses(x)))(places)
     still = _still(problem)
     enough = jnp.minimum(allowed / still.scene.rod.length, _CLOSE_ENOUGH[still.target.dtype.name])
+    starts = _starts(problem) if problem.start is None else still.idle[None]
     found = bounded_least_squares.nearest(
-        still.residual, lax.stop_gradient(_starts(tried, distance)), still.idle, enough
+        still.residual, lax.stop_gradient(starts), still.idle, enough
     )
     share = _moving(problem, found)
     there = problem.at(share)
@@ -218,11 +232,17 @@ def _reach(problem: _ReachProblem, allowed: Scalar) -> Reach:
     return Reach(problem.inputs(share), there, miss, miss <= allowed, allowed)
 
 
-def _starts(
-    tried: Float[Array, "tried inputs"], distance: Float[Array, " tried"]
-) -> Float[Array, "starts inputs"]:
-    """The nearest inputs, then repeatedly the nearest of those that are not close to a start
-    already chosen: there may be several minima."""
+def _starts(problem: _ReachProblem) -> Float[Array, "starts inputs"]:
+    """The nearest of random inputs, then repeatedly the nearest of those that are not close to a
+    start already chosen: there may be several minima."""
+    tried = jnp.asarray(
+        np.random.default_rng(0).uniform(size=(_SAMPLES, problem.low.size)), problem.low.dtype
+    )
+    tried = jnp.concatenate([problem.idle[None], tried])
+    places = jax.vmap(lambda share: problem.places(problem.at(share)))(
+        tried
+    )  # independent of the target: under vmap over targets solved once
+    distance = jax.vmap(lambda x: jnp.linalg.norm(problem.misses(x)))(places)
     distance, starts = jnp.where(jnp.isfinite(distance), distance, jnp.inf), []
     for _ in range(_STARTS):
         starts.append(tried[jnp.argmin(distance)])
