@@ -2,3 +2,7 @@
 
 Knows solved scenes. Must not know how many of them are searched or swept.
 """
+
+from .exporting import Fabrication, export
+
+__all__ = ["Fabrication", "export"]

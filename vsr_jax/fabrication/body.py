@@ -247,8 +247,8 @@ def _face(outer: Ring, holes: Iterable[Ring] = ()) -> np.ndarray:
 def _bottoms(tube: _Tube, steps: Sequence[_Step]) -> Iterator[np.ndarray]:
     """The ends of a hole inside the body, except those that open on a step."""
     open_rows = [step.wide for step in steps if any(tube is other for other in step.opened)]
-    starts = 1 + np.flatnonzero(tube.there[1:] & ~tube.there[:-1])
-    ends = np.flatnonzero(tube.there[:-1] & ~tube.there[1:])
+    starts = (1 + np.flatnonzero(tube.there[1:] & ~tube.there[:-1])).tolist()
+    ends = np.flatnonzero(tube.there[:-1] & ~tube.there[1:]).tolist()
     yield from (_face(_ring(tube, row)) for row in starts if row not in open_rows)
     yield from (_reversed(_face(_ring(tube, row))) for row in ends if row not in open_rows)
 

@@ -5,7 +5,7 @@ A breakpoint has two stations, one on each side, because sizes may jump there.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 from ..arm.routing import thread_tangent
 from ..arm.scene import Scene
 from ..solution.equilibrium import Equilibrium
-from ..typing import DTypeLike, Tree
+from ..typing import DTypeLike
 
 MOST_STATIONS = 20_000
 """Stations above which a tolerance is refused."""
@@ -29,6 +29,7 @@ _PROBES = (0.38, 0.71)
 coils between two stations are seen."""
 
 _FIRST_INTERVALS = 16
+_FEWEST_INTERVALS = 3
 _MOST_PARTS = 8
 _FEWEST_ANGLES, _MOST_ANGLES = 72, 720
 
@@ -136,7 +137,7 @@ class _Sampler:
         done: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         while low.size:
             off = self._deviation(low, high, piece)
-            parts = np.clip(np.ceil(np.sqrt(off / tolerance)), 1, _MOST_PARTS).astype(int)
+            parts = np.ceil(np.sqrt(off / tolerance)).clip(1, _MOST_PARTS).astype(int)
             fine = parts == 1
             done.append((low[fine], high[fine], piece[fine]))
             low, high, piece = _split(low[~fine], high[~fine], piece[~fine], parts[~fine])
@@ -158,7 +159,7 @@ class _Sampler:
     def _intervals(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         low, high = self.edges[:-1], self.edges[1:]
         share = np.ceil(_FIRST_INTERVALS * (high - low) / self.edges[-1]).astype(int)
-        return _split(low, high, np.arange(low.size), np.maximum(2, share))
+        return _split(low, high, np.arange(low.size), np.maximum(_FEWEST_INTERVALS, share))
 
     def _deviation(self, low: np.ndarray, high: np.ndarray, piece: np.ndarray) -> np.ndarray:
         """Distance [m] of the chords from the arm in each interval."""
@@ -205,7 +206,7 @@ def _typed(scene: Scene, X: np.ndarray) -> np.ndarray:
     return X.astype(scene.rod.length.dtype)
 
 
-def _in_blocks(function: Callable[[Array], Tree], X: np.ndarray) -> Tree:
+def _in_blocks(function: Callable[[Array], Any], X: np.ndarray) -> Any:
     """A function of abscissas, called with blocks of one size."""
     count = -(-X.size // _BLOCK)
     padded = np.concatenate((X, np.full(count * _BLOCK - X.size, X[-1], X.dtype)))
