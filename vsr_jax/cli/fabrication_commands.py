@@ -2,6 +2,7 @@
 
 import argparse
 
+from ..analysis.plausible import strain_warnings, warnings_of
 from ..files.scene_file import load
 from ..solution.solver import solve
 from .common import (
@@ -82,15 +83,20 @@ def _export(options: argparse.Namespace) -> int:
     files = {name: getattr(options, name) for name in _FILES}
     check_folders(*files.values())
     if options.inputs is None:
+        if (options.model, options.steps, options.tolerance) != (None, None, None):
+            raise ValueError(
+                "--inputs: got --model, --steps or --tolerance without it, need inputs to solve for"
+            )
         set_precision(options.precision)
         arm, _, title = load(options.scene)
-        arm = arm.astype(options.precision)
+        warn(warnings_of(arm))
     else:
         task = task_of(options)
         arm, title = (
             solve(task.scene, task.inputs, model=task.model, tolerance=options.tolerance),
             task.title,
         )
+        warn(strain_warnings(arm))
         if not bool(arm.converged):
             print("\n".join((title or options.scene, *arm.heading)))
             return NOT_CONVERGED

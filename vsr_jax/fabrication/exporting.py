@@ -212,8 +212,8 @@ def _given_bores(
 ) -> Float[np.ndarray, " threads"]:
     """Diameters [m] that are given, by the caller or by a chamber's area; NaN for the others."""
     number = len(scene.actuators)
-    single = bore is None or isinstance(bore, float | int) or np.ndim(bore) == 0  # type: ignore
-    values = [bore] * number if single else list(bore)
+    known = np.asarray(bore).tolist() if isinstance(bore, np.ndarray | Array) else bore
+    values = list(known) if isinstance(known, Sequence) else [known] * number
     if len(values) != number:
         raise ValueError(f"bore: got {bore!r}, need one diameter or {number}, one per actuator")
     areas = [actuator.pressure_area for actuator in scene.actuators]

@@ -137,11 +137,12 @@ class _Sampler:
         done: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         while low.size:
             off = self._deviation(low, high, piece)
-            parts = np.ceil(np.sqrt(off / tolerance)).clip(1, _MOST_PARTS).astype(int)
+            wanted = np.ceil(np.sqrt(off / tolerance))
+            parts = wanted.clip(1, _MOST_PARTS).astype(int)
             fine = parts == 1
             done.append((low[fine], high[fine], piece[fine]))
             low, high, piece = _split(low[~fine], high[~fine], piece[~fine], parts[~fine])
-            if low.size + sum(part[0].size for part in done) > MOST_STATIONS:
+            if np.sum(wanted) + sum(part[0].size for part in done) > MOST_STATIONS:
                 raise ValueError(
                     f"tolerance: got {tolerance:g} m, which needs more than {MOST_STATIONS} "
                     f"stations along the arm; need a larger one"

@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float
 
 from .stations import Stations
 
-_ROWS = 256
-"""Stations of one channel that are compared with all of another at a time."""
+_ROWS = 128
+"""Chords of one channel that are compared with all of another at a time."""
 
 
 @dataclass(frozen=True)
@@ -102,28 +102,59 @@ def _distance(stations: Stations, inside: np.ndarray, i: int, j: int) -> tuple[f
     Only places within a diameter of the body along X are compared: an arm that is bent onto itself
     has no wall there.
     """
-    threads, X = stations.threads, stations.X
-    rows, starts = np.flatnonzero(inside[:, i]), np.flatnonzero(inside[:-1, j] & inside[1:, j])
-    starts = starts[X[starts + 1] > X[starts]]
-    if not (rows.size and starts.size):
+    X = stations.X
+    chords = []
+    for thread in (i, j):
+        rows = np.flatnonzero(inside[:-1, thread] & inside[1:, thread] & (np.diff(X) > 0))
+        points = stations.threads[:, thread]
+        chords.append((rows, points[rows], points[rows + 1] - points[rows]))
+    (rows, a, along), (others, b, beside) = chords
+    if not (rows.size and others.size):
         return np.inf, np.nan
-    a, ab = threads[starts, j], threads[starts + 1, j] - threads[starts, j]
     near = 2 * np.max(np.linalg.norm(stations.outline, axis=-1))
     least, place = np.inf, np.nan
-    for block in np.array_split(rows, -(-rows.size // _ROWS)):
-        far = _to_segments(threads[block, i][:, None], a, ab)
-        apart = (X[block, None] < X[starts] - near) | (X[block, None] > X[starts + 1] + near)
-        far = np.min(np.where(apart, np.inf, far), axis=1)
-        row = int(np.argmin(far))
-        if far[row] < least:
-            least, place = float(far[row]), float(X[block[row]])
+    for block in np.array_split(np.arange(rows.size), -(-rows.size // _ROWS)):
+        row = rows[block]
+        far, share = _between_segments(a[block, None], along[block, None], b, beside)
+        apart = (X[row, None] > X[others + 1] + near) | (X[row + 1, None] < X[others] - near)
+        far = np.where(apart, np.inf, far)
+        nearest = np.unravel_index(np.argmin(far), far.shape)
+        if far[nearest] < least:
+            start, end = X[row[nearest[0]]], X[row[nearest[0]] + 1]
+            least, place = float(far[nearest]), float(start + share[nearest] * (end - start))
     return least, place
+
+
+def _between_segments(
+    a: np.ndarray, along: np.ndarray, b: np.ndarray, beside: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Distance of segments that start at `a` and `b`, and the share of the first at which it is:
+    at an end of one of the two, or where the common perpendicular meets both."""
+    far, share = _to_segments(b, a, along)
+    candidates = [(far, share), _to_segments(b + beside, a, along)]
+    for end in (0.0, 1.0):
+        far, _ = _to_segments(a + end * along, b, beside)
+        candidates.append((far, np.full_like(far, end)))
+    product, between = np.sum(along * beside, axis=-1), a - b
+    squares = np.sum(along**2, axis=-1), np.sum(beside**2, axis=-1)
+    offsets = np.sum(along * between, axis=-1), np.sum(beside * between, axis=-1)
+    determinant = squares[0] * squares[1] - product**2
+    skew = determinant > 1e-12 * squares[0] * squares[1]
+    divisor = np.where(skew, determinant, 1.0)
+    s = (product * offsets[1] - squares[1] * offsets[0]) / divisor
+    t = (squares[0] * offsets[1] - product * offsets[0]) / divisor
+    meets = skew & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)
+    across = np.linalg.norm(between + s[..., None] * along - t[..., None] * beside, axis=-1)
+    candidates.append((np.where(meets, across, np.inf), s))
+    fars, shares = (np.stack(part) for part in zip(*candidates, strict=True))
+    best = np.argmin(fars, axis=0)[None]
+    return np.take_along_axis(fars, best, 0)[0], np.take_along_axis(shares, best, 0)[0]
 
 
 def depth(outline: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Distance of points (stations, 2) from polygons (stations, corners, 2), positive inside."""
     edge = np.roll(outline, -1, axis=1) - outline
-    far = np.min(_to_segments(points[:, None], outline, edge), axis=1)
+    far = np.min(_to_segments(points[:, None], outline, edge)[0], axis=1)
     corner = outline - points[:, None]
     following = np.roll(corner, -1, axis=1)
     cross = corner[..., 0] * following[..., 1] - corner[..., 1] * following[..., 0]
@@ -131,8 +162,11 @@ def depth(outline: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.where(np.abs(turn) > np.pi, far, -far)
 
 
-def _to_segments(points: np.ndarray, start: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """Distance of points from segments."""
+def _to_segments(
+    points: np.ndarray, start: np.ndarray, along: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Distance of points from segments, and the share of the segment at which it is."""
     square = np.sum(along**2, axis=-1)
     share = np.sum((points - start) * along, axis=-1) / np.where(square > 0, square, 1.0)
-    return np.linalg.norm(points - start - np.clip(share, 0, 1)[..., None] * along, axis=-1)
+    share = np.clip(share, 0, 1)
+    return np.linalg.norm(points - start - share[..., None] * along, axis=-1), share

@@ -1,0 +1,497 @@
+"""Files for the workshop: read back by other programs and compared with the scene."""
+
+import contextlib
+import csv
+import io
+import pathlib
+import re
+import sys
+import warnings
+
+import ezdxf
+import jax
+import jax.numpy as jnp
+import manifold3d
+import numpy as np
+import pytest
+import stl
+import trimesh
+from scipy.interpolate import BSpline
+from scipy.sparse.csgraph import connected_components
+
+import vsr_jax as vsr
+from vsr_jax.cli import common as cli_common, main as cli
+from vsr_jax.fabrication.stations import stations_of
+
+HELIX = str(pathlib.Path(__file__).parents[1] / "notebooks" / "scenes" / "helix.toml")
+SOFT = vsr.Material(young=5.93e5, shear=2.00e5)
+BORE = 1.2e-3
+PITCH, RADIUS = 0.1, 0.006
+
+
+def tapered():
+    """A tapered disc: a helical tendon, a chamber that ends in the arm, an oblique tendon."""
+    rod = vsr.Rod(0.3, vsr.Circular(vsr.Taper(0.012, 0.010)), SOFT)
+    chamber = vsr.Chamber(vsr.Parallel(0.0, 0.0), np.pi / 4 * BORE**2, end=0.2)
+    oblique = vsr.Tendon(vsr.Linear(-0.009, 0.0, 0.004, 0.0))
+    return vsr.Scene(rod, [vsr.Tendon(vsr.Helix(RADIUS, pitch=PITCH)), chamber, oblique])
+
+
+def tube():
+    """A tube with three helical tendons."""
+    rod = vsr.Rod(0.2, vsr.Annular(0.010, vsr.Taper(0.003, 0.004)), SOFT)
+    phases = 2 * np.pi / 3 * np.arange(3)
+    paths = [vsr.Helix(0.007, pitch=0.3, phase=phase, hand="left") for phase in phases]
+    return vsr.Scene(rod, [vsr.Tendon(path) for path in paths])
+
+
+def curved():
+    """An ellipse along an arc."""
+    section = vsr.Elliptic(0.008, vsr.Taper(0.006, 0.005))
+    rod = vsr.Rod(0.2, section, SOFT, rest_strain=(0.5, 1.0, 6.0, 1.0, 0.0, 0.0))
+    return vsr.Scene(rod, [vsr.Tendon(vsr.Parallel(0.005, 0.001))])
+
+
+def stepped():
+    """A tube, then a rectangle, which a channel ends on, then a disc that crosses it."""
+    parts = [vsr.Annular(0.012, 0.004), vsr.Rectangular(0.012, 0.010), vsr.Circular(0.0055)]
+    rod = vsr.Rod(0.3, vsr.Joined([0.1, 0.2], parts), SOFT)
+    opened = vsr.Tendon(vsr.Parallel(0.009, 0.0), end=0.1)
+    buried = vsr.Tendon(vsr.Parallel(0.0, 0.0), start=0.15, end=0.25)
+    return vsr.Scene(rod, [opened, buried])
+
+
+CASES = {"tapered": tapered, "bent": tube, "curved": curved, "stepped": stepped}
+HANDLES = {"tapered": 2, "bent": 4, "curved": 1, "stepped": 0}
+"""Holes through the body less cavities in it."""
+
+
+def in_blocks(function, X):
+    """A function of abscissas, called with 64 at a time."""
+    blocks = np.split(np.pad(X, (0, -len(X) % 64), mode="edge"), -(-len(X) // 64))
+    parts = [function(jnp.asarray(block)) for block in blocks]
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[: len(X)], *parts)
+
+
+class Made:
+    """A scene, its equilibrium at rest or bent, and its exported files."""
+
+    def __init__(self, name, folder):
+        self.name, self.scene = name, CASES[name]()
+        bent = vsr.solve(self.scene, [0.8, 0.2, 0.0]) if name == "bent" else None
+        self.eq = vsr.solve(vsr.Scene(self.scene.rod), []) if bent is None else bent
+        arm = self.scene if bent is None else bent
+        self.files = {kind: folder / f"arm.{kind}" for kind in ("stl", "step", "csv", "dxf")}
+        self.made = vsr.export(arm, **self.files, bore=BORE)
+        self.mesh = trimesh.load(self.files["stl"])
+        self.length = float(self.scene.rod.length)
+
+    def pose(self, X):
+        """Poses at X [m], by the program that the export uses."""
+        return in_blocks(self.eq.pose, X)
+
+    def routing(self, i, X):
+        """Position (y, z) [m] of thread i in the sections."""
+        routing = jax.jit(jax.vmap(self.scene.actuators[i].routing))
+        return np.stack(in_blocks(routing, X), axis=-1)
+
+    def thread(self, i, X):
+        """Where thread i crosses the sections at X [mm], by the scene's routing and the pose."""
+        pose = self.pose(X)
+        sideways = np.einsum("sij,sj->si", pose[:, :3, 1:3], self.routing(i, X))
+        return 1e3 * (pose[:, :3, 3] + sideways)
+
+    def areas(self, X):
+        """Area [mm^2] of the section, and of each channel in its plane, shape (stations,)."""
+        rod, x = self.scene.rod, jnp.asarray(X)
+        rest = np.stack(jax.vmap(rod.rest)(x), axis=-1)
+        holes = []
+        for actuator in self.scene.actuators:
+            path = jax.vmap(actuator.routing.path)(x)
+            zero = np.zeros_like(x)
+            d = np.stack((zero, path.y, path.z), axis=-1)
+            slope = np.stack((zero, path.slope_y, path.slope_z), axis=-1)
+            t = np.cross(rest[:, :3], d) + rest[:, 3:] + slope
+            reach = None if actuator.reach(x[0]) is None else jax.vmap(actuator.reach)(x)
+            here = np.ones_like(x) if reach is None else np.asarray(reach)
+            across = np.pi / 4 * (1e3 * BORE) ** 2
+            holes.append(here * across * np.linalg.norm(t, axis=-1) / t[:, 0])
+        body = jax.vmap(lambda x: rod.section.geometry(x, rod.length).area)(x)
+        return 1e6 * np.asarray(body), holes
+
+    def volume(self):
+        r"""$\int A u_x - \sum_i a_i e_x \cdot (k \times d_i + u)\,dX$ [mm^3], by the midpoint
+        rule."""
+        X = (np.arange(600) + 0.5) / 600 * self.length
+        rest = jax.vmap(self.scene.rod.rest)
+        xi = np.array((self.eq.strain(X)).T if self.name == "bent" else rest(jnp.asarray(X)))
+        body, holes = self.areas(X)
+        total = body * xi[3]
+        for i, hole in enumerate(holes):
+            y, z = self.routing(i, X).T
+            total -= hole * (xi[3] + xi[1] * z - xi[2] * y)
+        return 1e3 * np.mean(total) * self.length
+
+    def loops(self, X):
+        """Area [mm^2] and centroid (y, z) [mm] of each closed curve in which the section's plane
+        cuts the surface, the largest first."""
+        g = self.pose([X])[0]
+        origin, axes = 1e3 * g[:3, 3], g[:3, 1:3]
+        segments = (trimesh.intersections.mesh_plane(self.mesh, g[:3, 0], origin) - origin) @ axes
+        corners, place = np.unique(segments.reshape(-1, 2).round(4), axis=0, return_inverse=True)
+        pairs = place.reshape(-1, 2)
+        graph = np.zeros((len(corners), len(corners)), bool)
+        graph[pairs[:, 0], pairs[:, 1]] = True
+        count, label = connected_components(graph, directed=False)
+        found = [_polygon(corners[label == i]) for i in range(count)]
+        return sorted(found, key=lambda loop: -loop[0])
+
+
+def _polygon(corners):
+    """Area and centroid of a convex polygon."""
+    middle = corners.mean(axis=0)
+    order = np.argsort(np.arctan2(*(corners - middle).T[::-1]))
+    a = corners[order] - middle
+    b = np.roll(a, -1, axis=0)
+    cross = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    area = cross.sum() / 2
+    return area, middle + (cross[:, None] * (a + b)).sum(axis=0) / (6 * area)
+
+
+@pytest.fixture(scope="module", params=CASES)
+def made(request, tmp_path_factory):
+    return Made(request.param, tmp_path_factory.mktemp("export"))
+
+
+def test_other_readers_find_a_closed_body_of_the_scenes_volume(made):
+    assert made.mesh.is_watertight
+    assert made.mesh.is_winding_consistent
+    read = stl.Mesh.from_file(str(made.files["stl"]))
+    assert bool(read.is_closed(exact=True))
+    volume = float(read.get_mass_properties()[0])
+    np.testing.assert_allclose(volume, made.volume(), rtol=5e-3)
+    np.testing.assert_allclose(made.made.body().volume, volume, rtol=1e-5)
+    vertices, faces = np.asarray(made.mesh.vertices, np.float32), np.asarray(made.mesh.faces)
+    solid = manifold3d.Manifold(manifold3d.Mesh(vertices, faces.astype(np.uint32)))
+    assert (solid.status(), solid.genus()) == (manifold3d.Error.NoError, HANDLES[made.name])
+
+
+def test_sections_and_channels_are_where_the_scene_says(made):
+    """At ten abscissas, by cutting the mesh."""
+    X = np.linspace(0.013, 0.987, 10) * made.length
+    areas, holes = made.areas(X)
+    section, length = made.scene.rod.section, made.scene.rod.length
+    hollow = jax.vmap(lambda x: section.inner_radius(x, length))(jnp.asarray(X)) > 0
+    for k, x in enumerate(X):
+        (outer, _), *inner = made.loops(x)
+        here = [i for i, hole in enumerate(holes) if hole[k] > 0]
+        assert len(inner) == len(here) + bool(hollow[k])
+        cut = outer - sum(size for size, _ in inner)
+        np.testing.assert_allclose(cut, areas[k] - sum(holes[i][k] for i in here), rtol=5e-3)
+        for i in here:
+            centre = 1e3 * made.routing(i, X[k : k + 1])[0]
+            near = min(inner, key=lambda loop: np.linalg.norm(loop[1] - centre))
+            assert np.linalg.norm(near[1] - centre) < 0.05
+            np.testing.assert_allclose(near[0], holes[i][k], rtol=0.02)
+
+
+def test_paths_are_those_of_the_equilibrium(made):
+    with open(made.files["csv"], newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    for i, actuator in enumerate(made.scene.actuators):
+        own = [row for row in rows if row["thread"] == str(i)]
+        X = np.array([float(row["X [mm]"]) for row in own])
+        assert np.all(np.diff(X) > 0)
+        ends = [0.0 if actuator.start is None else actuator.start]
+        ends.append(made.length if actuator.end is None else actuator.end)
+        np.testing.assert_allclose(X[[0, -1]], 1e3 * np.array(ends), atol=1e-6)
+        found = np.array([[float(row[f"{axis} [mm]"]) for axis in "xyz"] for row in own])
+        np.testing.assert_allclose(found, made.thread(i, X / 1e3), atol=2e-6)
+        for row in own:
+            turn, radius = np.radians(float(row["angle [deg]"])), float(row["radius [mm]"])
+            place = float(row["section y [mm]"]), float(row["section z [mm]"])
+            np.testing.assert_allclose(
+                place, (radius * np.cos(turn), radius * np.sin(turn)), atol=2e-6
+            )
+
+
+def _curves(path):
+    """Curves of a STEP file by name, as functions of their parameter."""
+    text = pathlib.Path(path).read_text(encoding="ascii")
+    assert text.startswith("ISO-10303-21;")
+    entities = dict(re.findall(r"^#(\d+)=(.*);$", text, flags=re.MULTILINE))
+    number = r"[-+\d.E]+"
+    curves = {}
+    for body in entities.values():
+        found = re.fullmatch(
+            r"B_SPLINE_CURVE_WITH_KNOTS\('(.*)',3,\((.*?)\),.*?,\(([\d,]+)\),\((.*)\),.*\)", body
+        )
+        if found:
+            name, places, counts, knots = found.groups()
+            controls = [
+                re.findall(number, entities[p[1:]].split("''")[1]) for p in places.split(",")
+            ]
+            knots = np.repeat(
+                [float(knot) for knot in knots.split(",")], [int(c) for c in counts.split(",")]
+            )
+            curves[name] = BSpline(knots, np.array(controls, float), 3)
+    return curves
+
+
+def test_step_curves_are_the_threads(made):
+    curves = _curves(made.files["step"])
+    assert len(curves) == 1 + len(made.scene.actuators)
+    for name, curve in curves.items():
+        X = np.linspace(curve.t[0], curve.t[-1], 101)
+        if name == "axis":
+            expected = 1e3 * made.pose(X / 1e3)[:, :3, 3]
+        else:
+            expected = made.thread(int(name.split()[1]), X / 1e3)
+        np.testing.assert_allclose(curve(X), expected, atol=5e-3)
+
+
+def test_step_file_opens_in_a_cad_kernel(made):
+    """Open CASCADE, as gmsh has it."""
+    try:
+        import gmsh
+    except OSError as error:
+        pytest.skip(f"gmsh cannot be loaded: {error}")
+    gmsh.initialize(interruptible=False)
+    try:
+        gmsh.option.setNumber("General.Terminal", 0)
+        tags = gmsh.model.occ.importShapes(str(made.files["step"]))
+        gmsh.model.occ.synchronize()
+        assert [dimension for dimension, _ in tags] == [1] * (1 + len(made.scene.actuators))
+        for i, (_, tag) in enumerate(tags[1:]):
+            low, high = (float(end[0]) for end in gmsh.model.getParametrizationBounds(1, tag))
+            X = np.linspace(low, high, 31)
+            found = np.reshape(gmsh.model.getValue(1, tag, X), (-1, 3))
+            np.testing.assert_allclose(found, made.thread(i, X / 1e3), atol=5e-3)
+    finally:
+        gmsh.finalize()
+
+
+def test_the_flat_pattern_of_a_helix_is_straight(made):
+    drawing = ezdxf.readfile(made.files["dxf"])
+    assert drawing.units == ezdxf.units.MM
+    space = drawing.modelspace()
+    for i, actuator in enumerate(made.scene.actuators):
+        parts = [np.array(e.get_points("xy")) for e in space.query(f'*[layer=="thread {i}"]')]
+        assert parts
+        if not isinstance(actuator.routing, vsr.Helix):
+            continue
+        radius, turn = 1e3 * float(actuator.routing.radius), 2 * np.pi
+        length = sum(np.linalg.norm(np.diff(part, axis=0), axis=1).sum() for part in parts)
+        expected = made.made.lengths.column("at rest [mm]")[i]
+        np.testing.assert_allclose(length, expected, rtol=1e-6)
+        across = np.concatenate(parts)[:, 1]
+        assert np.ptp(across) <= turn * radius * (1 + 1e-9)
+        x, y = np.concatenate(parts).T
+        place = radius * np.stack((np.cos(y / radius), np.sin(y / radius)), axis=-1)
+        np.testing.assert_allclose(place, 1e3 * made.routing(i, x / 1e3), atol=1e-6)
+
+
+def test_drilling_plan_and_lengths():
+    """The closed forms of a helix and of an oblique line."""
+    scene, discs = tapered(), [0.0, 0.02, 0.21, 0.3]
+    made = vsr.export(scene, discs=discs, bore=[None, None, 2e-3])
+    assert made.bores.tolist() == pytest.approx([1e-3, BORE, 2e-3], rel=1e-4)
+    plan = {
+        (row[0], row[2]): dict(zip(made.holes.columns, row, strict=True)) for row in made.holes.rows
+    }
+    # the chamber ends at 0.2 m
+    assert set(plan) == {(d, t) for d in range(4) for t in range(3)} - {(2, 1), (3, 1)}
+    for (disc, thread), row in plan.items():
+        assert row["X [mm]"] == pytest.approx(1e3 * discs[disc])
+        if thread == 0:
+            assert row["angle [deg]"] == pytest.approx(360 * discs[disc] / PITCH % 360, abs=1e-4)
+            assert row["radius [mm]"] == pytest.approx(1e3 * RADIUS, abs=1e-4)
+            tilt = np.degrees(np.arctan(2 * np.pi * RADIUS / PITCH))
+            assert row["tilt [deg]"] == pytest.approx(tilt, abs=1e-4)
+        if thread == 2:
+            assert row["y [mm]"] == pytest.approx(1e3 * (0.004 * discs[disc] - 0.009), abs=1e-4)
+            assert row["angle [deg]"] == pytest.approx(180)
+            assert row["bore [mm]"] == pytest.approx(2)
+    assert made.lengths.column("part") == ["cable", "tube", "cable"]
+    expected = 300 * np.hypot(1, 2 * np.pi * RADIUS / PITCH), 200, 300 * np.hypot(1, 0.004)
+    assert made.lengths.column("at rest [mm]") == pytest.approx(expected, abs=1e-4)
+    assert made.lengths.column("to X [mm]") == pytest.approx((300, 200, 300))
+    assert made.lengths.column("runs") == ["in a channel"] * 3
+    assert "thinnest: the wall" in str(made)
+
+
+def test_lengths_of_a_bent_arm(made):
+    bent = made.made.lengths.column("as exported [mm]")
+    expected = (
+        1e3 * np.asarray(made.eq.lengths)
+        if made.eq.scene.actuators
+        else made.made.lengths.column("at rest [mm]")
+    )
+    np.testing.assert_allclose(bent, expected, atol=1e-4)
+
+
+def crossing(start=0.002):
+    """Two threads that approach each other towards the tip, on an arm whose wall approaches
+    one."""
+    rod = vsr.Rod(0.1, vsr.Circular(vsr.Taper(0.010, 0.0066)), SOFT)
+    still = vsr.Tendon(vsr.Parallel(0.0055, 0.0))
+    return vsr.Scene(rod, [still, vsr.Tendon(vsr.Linear(start, 0.0, 0.015, 0.0))])
+
+
+def test_thin_walls_are_named():
+    with pytest.warns(UserWarning, match="the wall") as told:
+        made = vsr.export(crossing(), bore=1e-3, wall=1.2e-3)
+    sentences = [str(warning.message) for warning in told]
+    assert sentences == list(made.warnings)
+    assert all("\n" not in sentence for sentence in sentences)
+    assert sentences[0] == (
+        "the wall between the channel of thread 0 and the outside is 0.599 mm at X = 0.1 m, less "
+        "than 1.2 mm"
+    )
+    assert re.fullmatch(
+        r"the wall between the channel of thread 0 and the channel of thread 1 is 1 mm at "
+        r"X = 0\.1 m, less than 1\.2 mm",
+        sentences[1],
+    )
+    assert len(sentences) == 2
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert vsr.export(crossing(), bore=1e-3, wall=5e-4).warnings == ()
+
+
+def test_walls_between_helices_are_measured_across_them():
+    """Two helices of slope 1 a quarter turn apart: their least distance is shorter than that in the
+    section."""
+    rod = vsr.Rod(0.1, vsr.Circular(0.012), SOFT)
+    paths = [vsr.Helix(0.008, pitch=2 * np.pi * 0.008, phase=phase) for phase in (0.0, 0.8)]
+    found = vsr.export(vsr.Scene(rod, [vsr.Tendon(path) for path in paths]), bore=1e-3).walls
+    shift = np.linspace(-2, 2, 100_001)
+    distance = 0.008 * np.sqrt(2 - 2 * np.cos(0.8 + shift) + shift**2)
+    thickness = next(wall.thickness for wall in found if "thread 1" in wall.other)
+    np.testing.assert_allclose(thickness, distance.min() - 1e-3, atol=2e-5)
+    assert distance.min() < 0.75 * distance[50_000]
+
+
+def test_threads_in_the_open_have_no_channel(tmp_path):
+    """On discs outside a wire, and in the lumen of a tube."""
+    for section, radius in ((vsr.Circular(0.001), 0.005), (vsr.Annular(0.010, 0.008), 0.005)):
+        rod = vsr.Rod(0.1, section, SOFT, guide_radius=0.006)
+        made = vsr.export(vsr.Scene(rod, [vsr.Tendon(vsr.Parallel(radius, 0.0))]))
+        area = float(section.geometry(jnp.asarray(0.05), rod.length).area)
+        np.testing.assert_allclose(made.body().volume, 1e9 * area * 0.1, rtol=2e-3)
+        assert made.lengths.column("runs") == ["in the open"]
+        assert made.walls == ()
+
+
+def test_stations_meet_the_tolerance():
+    """Chords of an arc and of a helix: the sagitta is h^2 kappa / 8."""
+    scene = curved()
+    eq = vsr.solve(vsr.Scene(scene.rod), [])
+    numbers = []
+    for tolerance in (1e-4, 1e-5):
+        found = stations_of(eq, scene, tolerance)
+        numbers.append(found.X.size)
+        middle = 0.5 * (found.X[1:] + found.X[:-1])
+        chord = 0.5 * (found.pose[1:, :3, 3] + found.pose[:-1, :3, 3])
+        far = np.linalg.norm(np.asarray(eq.position(middle)) - chord, axis=1)
+        assert far.max() < 1.02 * tolerance
+    assert 1.5 < numbers[1] / numbers[0] < 4
+
+
+def test_sharp_bends_are_told():
+    rod = vsr.Rod(0.1, vsr.Circular(0.010), SOFT, rest_strain=(0, 0, 120.0, 1, 0, 0))
+    with pytest.warns(UserWarning, match="sections cross each other at X = 0 m"):
+        vsr.export(vsr.Scene(rod))
+
+
+def _batch():
+    scene = crossing()
+    return jax.vmap(lambda u: vsr.solve(scene, u))(jnp.ones((2, 2)))
+
+
+BAD = {
+    "arm": (lambda: vsr.export(3.0), r"arm: got 3\.0, need a Scene or an Equilibrium"),
+    "batch": (lambda: vsr.export(_batch()), r"batch of shape \(2,\)"),
+    "failed": (
+        lambda: vsr.export(vsr.solve(crossing(), [1e9, 0.0])),
+        "arm: got a solve that failed",
+    ),
+    "bore": (lambda: vsr.export(crossing(), bore=-1e-3), r"bore\[0\]: got -0.001, need .* > 0"),
+    "bores": (lambda: vsr.export(crossing(), bore=[1e-3] * 3), "bore: got .* 2, one per actuator"),
+    "wall": (lambda: vsr.export(crossing(), wall=0.0), "wall: got 0.0, need a finite number > 0"),
+    "discs": (lambda: vsr.export(crossing(), discs=[0.0, 0.2]), "discs: got 0.2 m, need 0 to 0.1"),
+    "one disc": (lambda: vsr.export(crossing(), discs=1), "discs: got 1, need an integer >= 2"),
+    "tolerance": (
+        lambda: vsr.export(crossing(), tolerance=0),
+        "tolerance: got 0, need a finite number > 0",
+    ),
+    "fine": (
+        lambda: vsr.export(curved(), tolerance=1e-14),
+        "tolerance: got 1e-14 m, which needs more than 20000 stations",
+    ),
+    "meeting": (
+        lambda: vsr.export(crossing(0.0045), bore=1e-3, stl="never.stl"),
+        r"bore: got 1 mm, .* thread 0 and the channel of thread 1 is -1 mm at X = 0\.0",
+    ),
+    "traced": (
+        lambda: jax.jit(lambda s: vsr.export(s).bores)(crossing()),
+        "arm: got traced numbers",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.filterwarnings("ignore:the wall")
+def test_errors_have_one_line(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    call, message = BAD[name]
+    with pytest.raises(ValueError, match=message) as caught:
+        call()
+    assert "\n" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("kind", "missing"), [("stl", "manifold3d"), ("dxf", "ezdxf")])
+def test_a_missing_library_names_the_extra(kind, missing, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, missing, None)
+    with pytest.raises(ImportError, match=rf'{missing} is not installed.*"vsr-jax\[fabrication\]"'):
+        vsr.export(crossing(), **{kind: tmp_path / "arm"}, bore=1e-3)
+    assert list(tmp_path.iterdir()) == []
+
+
+def run(*arguments):
+    """Exit code and what was printed."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = cli.main(["export", HELIX, *map(str, arguments)])
+    return code, out.getvalue(), err.getvalue()
+
+
+def test_the_command_writes_what_it_is_asked_for(tmp_path):
+    kinds = ("stl", "step", "csv", "dxf", "holes", "lengths")
+    files = {kind: tmp_path / f"arm.{kind}" for kind in kinds}
+    options = [part for kind, path in files.items() for part in (f"--{kind}", path)]
+    code, out, err = run(*options, "--bore", 0.001, "--wall", 0.005, "--discs", 0, 0.5)
+    assert code == cli_common.DONE
+    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in files.values()}
+    assert trimesh.load(files["stl"]).is_watertight
+    # the paper's helix: alpha = 1.529, r = 5 mm
+    assert "One helical thread" in out
+    angle = np.degrees(0.5 / (0.005 * np.tan(1.529))) % 360
+    holes = files["holes"].read_text(encoding="utf-8").splitlines()
+    assert len(holes) == 3
+    assert float(holes[2].split(",")[3]) == pytest.approx(angle, abs=1e-3)
+    assert re.search(r"^vsr-jax: warning: the wall between .* less than 5 mm$", err, re.MULTILINE)
+
+
+def test_the_command_bends_the_arm_and_says_what_is_wrong(tmp_path):
+    step = tmp_path / "arm.step"
+    assert run("--inputs", -15, "--step", step)[0] == cli_common.DONE
+    tip = _curves(step)["axis"](750.0)
+    scene = vsr.load(HELIX).scene
+    np.testing.assert_allclose(tip, 1e3 * vsr.solve(scene, [-15.0]).tip[:3, 3], atol=1e-5)
+    assert run("--inputs", -5e3)[0] == cli_common.NOT_CONVERGED
+    for wrong in (("--steps", 8), ("--stl", tmp_path / "none" / "arm.stl"), ("--bore", -1)):
+        code, _, err = run(*wrong)
+        assert (code, err.count("\n")) == (cli_common.BAD_USAGE, 1)
