@@ -5,6 +5,7 @@ import csv
 import io
 import pathlib
 import re
+import runpy
 import sys
 import warnings
 
@@ -372,15 +373,17 @@ def test_walls_between_helices_are_measured_across_them():
     assert distance.min() < 0.75 * distance[50_000]
 
 
-def test_threads_in_the_open_have_no_channel(tmp_path):
-    """On discs outside a wire, and in the lumen of a tube."""
-    for section, radius in ((vsr.Circular(0.001), 0.005), (vsr.Annular(0.010, 0.008), 0.005)):
-        rod = vsr.Rod(0.1, section, SOFT, guide_radius=0.006)
-        made = vsr.export(vsr.Scene(rod, [vsr.Tendon(vsr.Parallel(radius, 0.0))]))
-        area = float(section.geometry(jnp.asarray(0.05), rod.length).area)
-        np.testing.assert_allclose(made.body().volume, 1e9 * area * 0.1, rtol=2e-3)
-        assert made.lengths.column("runs") == ["in the open"]
-        assert made.walls == ()
+def test_threads_in_the_open_have_no_channel():
+    """On discs outside a tube, and in its lumen."""
+    section = vsr.Annular(0.004, 0.003)
+    rod = vsr.Rod(0.1, section, SOFT, guide_radius=0.006)
+    paths = [vsr.Parallel(0.0, 0.005), vsr.Parallel(0.001, 0.0)]
+    made = vsr.export(vsr.Scene(rod, [vsr.Tendon(path) for path in paths]))
+    area = float(section.geometry(jnp.asarray(0.05), rod.length).area)
+    np.testing.assert_allclose(made.body().volume, 1e9 * area * 0.1, rtol=2e-3)
+    assert made.lengths.column("runs") == ["in the open"] * 2
+    assert made.walls == ()
+    assert made.holes.column("radius [mm]")[:2] == [5.0, 1.0]
 
 
 def test_stations_meet_the_tolerance():
@@ -458,6 +461,18 @@ def test_a_missing_library_names_the_extra(kind, missing, tmp_path, monkeypatch)
     with pytest.raises(ImportError, match=rf'{missing} is not installed.*"vsr-jax\[fabrication\]"'):
         vsr.export(crossing(), **{kind: tmp_path / "arm"}, bore=1e-3)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_guide_runs(tmp_path, monkeypatch):
+    page = pathlib.Path(__file__).parents[1] / "docs" / "fabrication.md"
+    (code,) = re.findall(r"^```python\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    pathlib.Path("guide.py").write_text(code, encoding="utf-8")
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        runpy.run_path("guide.py")
+    assert "thinnest: the wall between" in out.getvalue()
+    written = {path.name for path in tmp_path.iterdir()}
+    assert written == {"guide.py", "arm.step", "holes.csv", "bent.csv"}
 
 
 def run(*arguments):

@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float
 
 from .stations import Stations
 
-_ROWS = 128
-"""Chords of one channel that are compared with all of another at a time."""
+_ROWS = 32
+"""Chords of one channel that are compared at a time with the nearby ones of another."""
 
 
 @dataclass(frozen=True)
@@ -76,9 +76,9 @@ def walls(stations: Stations, bores: Float[np.ndarray, " threads"]) -> list[Wall
     """The thinnest walls: of each channel to the outside and to the central hole, and of every two
     channels, between tubes of the given diameters [m] around the threads."""
     inside, found = channels(stations), []
-    for depth, other in zip(depths(stations), ("the outside", "the central hole"), strict=True):
+    for room, other in zip(depths(stations), ("the outside", "the central hole"), strict=True):
         for i, bore in enumerate(bores):
-            here = np.where(inside[:, i], depth[:, i], np.inf)
+            here = np.where(inside[:, i], room[:, i], np.inf)
             row = int(np.argmin(here))
             if np.isfinite(here[row]):
                 X, thickness = float(stations.X[row]), float(here[row] - bore / 2)
@@ -99,8 +99,8 @@ def _pairs(stations: Stations) -> Iterator[tuple[int, int]]:
 def _distance(stations: Stations, inside: np.ndarray, i: int, j: int) -> tuple[float, float]:
     """Least distance [m] in space between the channels of two threads, and its X on the first.
 
-    Only places within a diameter of the body along X are compared: an arm that is bent onto itself
-    has no wall there.
+    Only places near each other along X are compared: an arm that is bent onto itself has no wall
+    there.
     """
     X = stations.X
     chords = []
@@ -115,9 +115,11 @@ def _distance(stations: Stations, inside: np.ndarray, i: int, j: int) -> tuple[f
     least, place = np.inf, np.nan
     for block in np.array_split(np.arange(rows.size), -(-rows.size // _ROWS)):
         row = rows[block]
-        far, share = _between_segments(a[block, None], along[block, None], b, beside)
-        apart = (X[row, None] > X[others + 1] + near) | (X[row + 1, None] < X[others] - near)
-        far = np.where(apart, np.inf, far)
+        low, high = X[row[0]] - near, X[row[-1] + 1] + near
+        close = (X[others + 1] >= low) & (X[others] <= high)
+        if not np.any(close):
+            continue
+        far, share = _between_segments(a[block, None], along[block, None], b[close], beside[close])
         nearest = np.unravel_index(np.argmin(far), far.shape)
         if far[nearest] < least:
             start, end = X[row[nearest[0]]], X[row[nearest[0]] + 1]
