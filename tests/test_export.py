@@ -193,7 +193,7 @@ def test_sections_and_channels_are_where_the_scene_says(made):
             centre = 1e3 * made.routing(i, X[k : k + 1])[0]
             near = min(inner, key=lambda loop: np.linalg.norm(loop[1] - centre))
             assert np.linalg.norm(near[1] - centre) < 0.05
-            np.testing.assert_allclose(near[0], holes[i][k], rtol=0.02)
+            np.testing.assert_allclose(near[0], holes[i][k], rtol=2e-3)
 
 
 def test_paths_are_those_of_the_equilibrium(made):
@@ -375,8 +375,8 @@ def test_walls_between_helices_are_measured_across_them():
 
 def test_threads_in_the_open_have_no_channel():
     """On discs outside a tube, and in its lumen."""
-    section = vsr.Annular(0.004, 0.003)
-    rod = vsr.Rod(0.1, section, SOFT, guide_radius=0.006)
+    section = vsr.Annular(0.004, 0.0037)
+    rod = vsr.Rod(0.1, section, SOFT, guide_radius=0.006)  # a thin wall
     paths = [vsr.Parallel(0.0, 0.005), vsr.Parallel(0.001, 0.0)]
     made = vsr.export(vsr.Scene(rod, [vsr.Tendon(path) for path in paths]))
     area = float(section.geometry(jnp.asarray(0.05), rod.length).area)

@@ -150,16 +150,19 @@ def _rings(
     yield stations.outline.copy(), np.ones(stations.X.size, bool)
     hollow = stations.inner > 0
     if np.any(hollow):
-        circle = _circle(np.max(stations.inner), tolerance)
+        # as many corners as the outline has: the wall of a thin tube keeps its share of the area
+        circle = _circle(stations.outline.shape[1])
         yield stations.inner[:, None, None] * circle, hollow
     for i, there in enumerate(channels(stations).T):
         if np.any(there):
-            circle = _circle(bores[i] / 2, tolerance)
-            yield _channel(stations, i, bores[i] / 2 * circle), there
+            corners = polygon_size(bores[i] / 2, tolerance, _FEWEST_CORNERS)
+            angle = 2 * np.pi / corners
+            radius = bores[i] / 2 * np.sqrt(angle / np.sin(angle))  # has the area of the circle
+            yield _channel(stations, i, radius * _circle(corners)), there
 
 
-def _circle(radius: float, tolerance: float) -> np.ndarray:
-    corners = polygon_size(radius, tolerance, _FEWEST_CORNERS)
+def _circle(corners: int) -> np.ndarray:
+    """Corners of a regular polygon in the unit circle, counterclockwise."""
     angle = 2 * np.pi * np.arange(corners) / corners
     return np.stack((np.cos(angle), np.sin(angle)), axis=-1)
 
