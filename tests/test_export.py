@@ -19,6 +19,7 @@ import stl
 import trimesh
 from scipy.interpolate import BSpline
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 
 import vsr_jax as vsr
 from vsr_jax.cli import common as cli_common, main as cli
@@ -373,6 +374,27 @@ def test_walls_between_helices_are_measured_across_them():
     assert distance.min() < 0.75 * distance[50_000]
 
 
+def steep(pitch):
+    """A helical thread of the given pitch."""
+    rod = vsr.Rod(0.1, vsr.Circular(0.012), SOFT)
+    return vsr.Scene(rod, [vsr.Tendon(vsr.Helix(0.008, pitch=pitch))])
+
+
+def test_oblique_channels_are_round():
+    """A helix of 60 degrees: every corner of its channel is at the radius of the bore from it."""
+    pitch, bore = 2 * np.pi * 0.008 / np.tan(np.pi / 3), 2e-3
+    made = vsr.export(steep(pitch), bore=bore)
+    points = made.body().vertices
+    X = np.linspace(-0.01, 0.11, 400_001)
+    turn = 2 * np.pi * X / pitch
+    helix = 1e3 * np.stack((X, 0.008 * np.cos(turn), 0.008 * np.sin(turn)), axis=-1)
+    wall = (np.hypot(*points[:, 1:].T) < 11.5) & (points[:, 0] > 2) & (points[:, 0] < 98)
+    far, _ = KDTree(helix).query(points[wall])
+    assert far.size > 1000
+    # 32 corners of the area of the circle, 0.3 % outside of it
+    np.testing.assert_allclose(far, 1e3 * bore / 2, atol=5e-3)
+
+
 def test_threads_in_the_open_have_no_channel():
     """On discs outside a tube, and in its lumen."""
     section = vsr.Annular(0.004, 0.0037)
@@ -408,8 +430,7 @@ def test_sharp_bends_are_told():
 
 
 def _batch():
-    scene = crossing()
-    return jax.vmap(lambda u: vsr.solve(scene, u))(jnp.ones((2, 2)))
+    return jax.tree.map(lambda leaf: jnp.stack((leaf, leaf)), vsr.solve(crossing(), [1.0, 0.0]))
 
 
 BAD = {
@@ -435,6 +456,10 @@ BAD = {
     "meeting": (
         lambda: vsr.export(crossing(0.0045), bore=1e-3, stl="never.stl"),
         r"bore: got 1 mm, .* thread 0 and the channel of thread 1 is -1 mm at X = 0\.0",
+    ),
+    "coil": (
+        lambda: vsr.export(steep(0.003), bore=1e-3, stl="never.stl"),
+        "bore: got 1 mm for thread 0, which winds too steeply",
     ),
     "traced": (
         lambda: jax.jit(lambda s: vsr.export(s).bores)(crossing()),

@@ -12,16 +12,17 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..arm.scene import Scene
 from ..files.output import replacing
 from ..typing import PathLike
+from .channels import channel_rings
 from .libraries import library
-from .stations import Stations, polygon_size
+from .stations import Stations
 from .walls import Wall, channels, depth
 
 MILLIMETRES = 1e3
 """Millimetres per metre: files for the workshop are in millimetres."""
 
-_FEWEST_CORNERS = 32
 _EQUAL = 1e-9
 
 
@@ -63,6 +64,7 @@ class _Step(NamedTuple):
 
 
 def body_of(
+    scene: Scene,
     stations: Stations,
     bores: Float[np.ndarray, " threads"],
     walls: Sequence[Wall],
@@ -71,8 +73,8 @@ def body_of(
     """The body at its stations, with a channel of diameter `bores` [m] around each thread where it
     runs in the material. A channel ends flat where its thread is tied.
 
-    **Raises:** `ValueError` if a channel meets another one, the outside or the central hole;
-    `ImportError` without manifold3d.
+    **Raises:** `ValueError` if a channel meets another one, the outside or the central hole, or
+    winds too steeply; `ImportError` without manifold3d.
     """
     for wall in walls:
         if not wall.thickness > 0:
@@ -81,7 +83,7 @@ def body_of(
                 f"that stay in the material and apart from each other"
             )
     stations = _without_rounding(stations)
-    outer, *holes = _tubes(stations, bores, tolerance)
+    outer, *holes = _tubes(stations, _channels(scene, stations, bores, tolerance))
     steps = [
         step
         for row in _jumps(stations.outline, stations)
@@ -130,12 +132,14 @@ def _without_rounding(stations: Stations) -> Stations:
     return stations._replace(pose=pose)
 
 
-def _tubes(
-    stations: Stations, bores: Float[np.ndarray, " threads"], tolerance: float
-) -> Iterator[_Tube]:
+Rings = tuple[np.ndarray, np.ndarray]
+"""Rings (y, z) [m] at the stations, and where they are there."""
+
+
+def _tubes(stations: Stations, channel_tubes: Iterable[Rings]) -> Iterator[_Tube]:
     """The outer wall, then the central hole and the channels, where there are some."""
     count = 0
-    for rings, there in _rings(stations, bores, tolerance):
+    for rings, there in (*_walls(stations), *channel_tubes):
         jumps = _jumps(rings, stations)
         equal = np.setdiff1d(np.flatnonzero(np.diff(stations.X) == 0), jumps)
         rings[equal] = rings[equal + 1]
@@ -144,36 +148,33 @@ def _tubes(
         yield _Tube(rings, there, vertices)
 
 
-def _rings(
-    stations: Stations, bores: Float[np.ndarray, " threads"], tolerance: float
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _walls(stations: Stations) -> Iterator[Rings]:
+    """The outline and, if there is one, the central hole. It has as many corners as the outline, so
+    that the wall of a thin tube keeps its share of the area."""
     yield stations.outline.copy(), np.ones(stations.X.size, bool)
     hollow = stations.inner > 0
     if np.any(hollow):
-        # as many corners as the outline has: the wall of a thin tube keeps its share of the area
-        circle = _circle(stations.outline.shape[1])
+        corners = stations.outline.shape[1]
+        angle = 2 * np.pi * np.arange(corners) / corners
+        circle = np.stack((np.cos(angle), np.sin(angle)), axis=-1)
         yield stations.inner[:, None, None] * circle, hollow
-    for i, there in enumerate(channels(stations).T):
+
+
+def _channels(
+    scene: Scene, stations: Stations, bores: Float[np.ndarray, " threads"], tolerance: float
+) -> Iterator[Rings]:
+    inside = channels(stations)
+    rings, off = channel_rings(scene, stations, bores, tolerance)
+    for i, there in enumerate(inside.T):
+        lost = there & ~(off[:, i] < tolerance)
+        if np.any(lost):
+            raise ValueError(
+                f"bore: got {MILLIMETRES * bores[i]:.4g} mm for thread {i}, which winds too "
+                f"steeply for a channel of this size at X = {stations.X[np.argmax(lost)]:.4g} m; "
+                f"need a smaller bore or a longer pitch"
+            )
         if np.any(there):
-            corners = polygon_size(bores[i] / 2, tolerance, _FEWEST_CORNERS)
-            angle = 2 * np.pi / corners
-            radius = bores[i] / 2 * np.sqrt(angle / np.sin(angle))  # has the area of the circle
-            yield _channel(stations, i, radius * _circle(corners)), there
-
-
-def _circle(corners: int) -> np.ndarray:
-    """Corners of a regular polygon in the unit circle, counterclockwise."""
-    angle = 2 * np.pi * np.arange(corners) / corners
-    return np.stack((np.cos(angle), np.sin(angle)), axis=-1)
-
-
-def _channel(stations: Stations, thread: int, circle: np.ndarray) -> np.ndarray:
-    r"""The section of a round channel across an oblique thread: an ellipse,
-    $d + (1 + s s^T / (1 + \sqrt{1 + |s|^2})) c$ with the thread's slope $s$ at rest."""
-    slope = stations.slope[:, thread, None]
-    along = np.sum(slope * circle, axis=-1, keepdims=True)
-    secant = np.sqrt(1 + np.sum(slope**2, axis=-1, keepdims=True))
-    return stations.path[:, thread, None] + circle + slope * along / (1 + secant)
+            yield rings[i], there
 
 
 def _jumps(rings: np.ndarray, stations: Stations) -> np.ndarray:

@@ -67,7 +67,7 @@ class Fabrication:
         **Raises:** `ValueError` if a channel meets another one or a wall; `ImportError` without
         manifold3d.
         """
-        return body_of(self.stations, self.bores, self.walls, self.tolerance)
+        return body_of(self.scene, self.stations, self.bores, self.walls, self.tolerance)
 
     def curves(self) -> list[Curve]:
         """The axis and the threads in space, in millimetres, with X as their parameter."""

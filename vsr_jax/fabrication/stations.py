@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ..arm.routing import thread_tangent
 from ..arm.scene import Scene
@@ -40,8 +40,8 @@ class Stations(NamedTuple):
     **Fields:** `X` (stations,); `piece`, the smooth piece of the arm of each station; `pose`
     (stations, 4, 4); `outline` (y, z) of the outer wall, counterclockwise from the y axis to the z
     axis, (stations, angles, 2); `inner`, radius of the central hole (stations,); `path` (y, z) of
-    each thread (stations, threads, 2); `slope` of each thread at rest to the section's normal,
-    $(t_y, t_z) / t_x$; `laid`, whether the thread is there (stations, threads).
+    each thread (stations, threads, 2); `laid`, whether the thread is there (stations, threads);
+    `inside`, the abscissas moved into their pieces by rounding, where sections are evaluated.
     """
 
     X: Float[np.ndarray, " stations"]
@@ -50,8 +50,8 @@ class Stations(NamedTuple):
     outline: Float[np.ndarray, "stations angles 2"]
     inner: Float[np.ndarray, " stations"]
     path: Float[np.ndarray, "stations threads 2"]
-    slope: Float[np.ndarray, "stations threads 2"]
-    laid: np.ndarray
+    laid: Bool[np.ndarray, "stations threads"]
+    inside: Float[np.ndarray, " stations"]
 
     def place(self, yz: Float[np.ndarray, "stations points 2"]) -> np.ndarray:
         """Points of the sections in space [m], shape (stations, points, 3)."""
@@ -78,9 +78,9 @@ def stations_of(eq: Equilibrium, scene: Scene, tolerance: float) -> Stations:
 
 
 def sections_at(scene: Scene, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Position (y, z) [m] and slope of each thread at rest, and whether it is laid there, each with
-    shape (stations, threads, ...). A thread is laid at both of its ends."""
-    found = _in_blocks(lambda x: _sections(scene, x, jnp.zeros(1, x.dtype)), _typed(scene, X))
+    """Position (y, z) [m] of each thread, its slope $(t_y, t_z) / t_x$ at rest, and whether it is
+    laid there, each with shape (stations, threads, ...). A thread is laid at both of its ends."""
+    found = in_blocks(lambda x: _sections(scene, x, jnp.zeros(1, x.dtype)), _typed(scene, X))
     laid = np.array(
         [(low - 1e-9 * high <= X) & (high * (1 + 1e-9) >= X) for low, high in thread_ends(scene)]
     )
@@ -121,14 +121,12 @@ class _Sampler:
         x = _typed(self.scene, X)
         low, high = (_typed(self.scene, ends) for ends in (self.edges[:-1], self.edges[1:]))
         inside = np.clip(x, np.nextafter(low, high)[piece], np.nextafter(high, low)[piece])
-        pose = _in_blocks(lambda x: self.eq.pose(x), x)
-        outline, inner, path, slope = _in_blocks(
-            lambda x: _sections(self.scene, x, self.angle), inside
-        )
+        pose = in_blocks(lambda x: self.eq.pose(x), x)
+        outline, inner, path, _ = in_blocks(lambda x: _sections(self.scene, x, self.angle), inside)
         middle = 0.5 * (self.edges[:-1] + self.edges[1:])[piece]
         laid = np.array([(low < middle) & (middle < high) for low, high in self.ends])
         return Stations(
-            X, piece, pose, outline, inner, path, slope, laid.reshape(-1, X.size).T.astype(bool)
+            X, piece, pose, outline, inner, path, laid.reshape(-1, X.size).T.astype(bool), inside
         )
 
     def resolved(self, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
@@ -207,7 +205,7 @@ def _typed(scene: Scene, X: np.ndarray) -> np.ndarray:
     return X.astype(scene.rod.length.dtype)
 
 
-def _in_blocks(function: Callable[[Array], Any], X: np.ndarray) -> Any:
+def in_blocks(function: Callable[[Array], Any], X: np.ndarray) -> Any:
     """A function of abscissas, called with blocks of one size."""
     count = -(-X.size // _BLOCK)
     padded = np.concatenate((X, np.full(count * _BLOCK - X.size, X[-1], X.dtype)))
