@@ -17,11 +17,8 @@ from ..files.output import replacing
 from ..typing import PathLike
 from .channels import channel_rings
 from .libraries import library
-from .stations import Stations
+from .stations import MILLIMETRES, Stations
 from .walls import Wall, channels, depth
-
-MILLIMETRES = 1e3
-"""Millimetres per metre: files for the workshop are in millimetres."""
 
 _EQUAL = 1e-9
 
@@ -79,7 +76,7 @@ def body_of(
     for wall in walls:
         if not wall.thickness > 0:
             raise ValueError(
-                f"bore: got {1e3 * bores[wall.thread]:.4g} mm, with which {wall}; need channels "
+                f"bore: got {MILLIMETRES * bores[wall.thread]:.4g} mm, with which {wall}; need channels "
                 f"that stay in the material and apart from each other"
             )
     stations = _without_rounding(stations)

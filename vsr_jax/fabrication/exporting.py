@@ -17,9 +17,9 @@ from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
 from ..typing import ArrayLike, PathLike, VectorLike
 from ..validation import concrete, count, instance, numbers, on_arm, positive
-from .body import MILLIMETRES, Body, body_of, folds, write_stl
+from .body import Body, body_of, folds, write_stl
 from .flat_pattern import write_dxf
-from .stations import Stations, stations_of
+from .stations import MILLIMETRES, Stations, stations_of
 from .step_file import Curve, write_step
 from .tables import Table, hole_table, length_table, part_name, path_table, write_csv
 from .walls import Wall, default_bores, walls
@@ -199,12 +199,13 @@ def _solved(arm: Scene | Equilibrium) -> Equilibrium:
     if any(concrete(leaf) is None for leaf in jax.tree.leaves(eqx.filter(arm, eqx.is_array))):
         raise ValueError("arm: got traced numbers, need known ones: call export outside of jax.jit")
     if isinstance(arm, Scene):
-        none = jnp.zeros(0, arm.rod.length.dtype)
-        return solve(Scene(arm.rod), none, throw=True)
-    arm.refuse_batch()
-    if not bool(arm.converged):
-        raise ValueError(f"arm: got a solve that failed ({arm.message}), need a converged one")
-    return arm
+        eq = solve(Scene(arm.rod), jnp.zeros(0, arm.rod.length.dtype))
+    else:
+        eq = arm
+    eq.refuse_batch()
+    if not bool(eq.converged):
+        raise ValueError(f"arm: got a solve that failed ({eq.message}), need a converged one")
+    return eq
 
 
 def _given_bores(

@@ -7,9 +7,8 @@ import numpy as np
 
 from ..files.output import replacing
 from ..typing import PathLike
-from .body import MILLIMETRES
 from .libraries import library
-from .stations import Stations
+from .stations import MILLIMETRES, Stations
 
 _EDGES = "edges"
 

@@ -18,6 +18,9 @@ from ..arm.scene import Scene
 from ..solution.equilibrium import Equilibrium
 from ..typing import DTypeLike
 
+MILLIMETRES = 1e3
+"""Millimetres per metre: files for the workshop are in millimetres."""
+
 MOST_STATIONS = 20_000
 """Stations above which a tolerance is refused."""
 

@@ -12,8 +12,7 @@ from ..arm.actuator import Actuator
 from ..arm.scene import Scene
 from ..files.output import replacing
 from ..typing import PathLike
-from .body import MILLIMETRES
-from .stations import Stations, sections_at, thread_ends
+from .stations import MILLIMETRES, Stations, sections_at, thread_ends
 from .walls import channels
 
 _DECIMALS = 4

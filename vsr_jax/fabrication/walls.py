@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .stations import Stations
+from .stations import MILLIMETRES, Stations
 
 _ROWS = 32
 """Chords of one channel that are compared at a time with the nearby ones of another."""
@@ -28,7 +28,7 @@ class Wall:
     def __str__(self) -> str:
         return (
             f"the wall between the channel of thread {self.thread} and {self.other} is "
-            f"{1e3 * self.thickness:.3g} mm at X = {self.X:.4g} m"
+            f"{MILLIMETRES * self.thickness:.3g} mm at X = {self.X:.4g} m"
         )
 
 
