@@ -76,8 +76,8 @@ def body_of(
     for wall in walls:
         if not wall.thickness > 0:
             raise ValueError(
-                f"bore: got {MILLIMETRES * bores[wall.thread]:.4g} mm, with which {wall}; need channels "
-                f"that stay in the material and apart from each other"
+                f"bore: got {MILLIMETRES * bores[wall.thread]:.4g} mm, with which {wall}; need "
+                f"channels that stay in the material and apart from each other"
             )
     stations = _without_rounding(stations)
     outer, *holes = _tubes(stations, _channels(scene, stations, bores, tolerance))

@@ -62,13 +62,12 @@ def _turns(
 ) -> Iterator[np.ndarray]:
     """The unrolled path, a part for each turn, with points on the seam where it is crossed."""
     whole = np.arange(np.ceil(np.min(turns)), np.floor(np.max(turns)) + 1)
-    crossings = [
-        (row + share, turn)
+    at = sorted(
+        row + (turn - turns[row]) / (turns[row + 1] - turns[row])
         for turn in whole
         for row in np.flatnonzero((turns[:-1] < turn) != (turns[1:] < turn))
-        for share in [(turn - turns[row]) / (turns[row + 1] - turns[row])]
-    ]
-    rows, at = np.arange(turns.size), sorted(place for place, _ in crossings)
+    )
+    rows = np.arange(turns.size)
     for low, high in zip([0.0, *at], [*at, turns.size - 1.0], strict=True):
         if high <= low:
             continue
