@@ -153,6 +153,11 @@ def test_sharp_bends_are_told():
         vsr.export(vsr.Scene(rod))
 
 
+def broken():
+    """A path that is NaN between two abscissas at which a scene checks its paths."""
+    return vsr.Function(lambda X: (jnp.where((X > 0.1035) & (X < 0.106), jnp.nan, 0.001), 0.0))
+
+
 def _batch():
     return jax.tree.map(lambda leaf: jnp.stack((leaf, leaf)), vsr.solve(crossing(), [1.0, 0.0]))
 
@@ -184,6 +189,10 @@ BAD = {
     "coil": (
         lambda: vsr.export(steep(0.003), bore=1e-3, stl="never.stl"),
         "bore: got 1 mm for thread 0, which winds too steeply",
+    ),
+    "nan": (
+        lambda: vsr.export(vsr.Scene(arc().rod, [vsr.Tendon(broken())])),
+        r"arm: got a shape or a path that is NaN near X = 0\.1",
     ),
     "traced": (
         lambda: jax.jit(lambda s: vsr.export(s).bores)(crossing()),

@@ -74,7 +74,7 @@ def stations_of(eq: Equilibrium, scene: Scene, tolerance: float) -> Stations:
 
     **Arguments:** `eq`: gives the poses; `scene`: gives sections and threads, on the same rod.
 
-    **Raises:** `ValueError` if more than `MOST_STATIONS` are needed.
+    **Raises:** `ValueError` if more than `MOST_STATIONS` are needed, and for NaN.
     """
     sampler = _Sampler(eq, scene, tolerance)
     return sampler.at(*sampler.resolved(tolerance))
@@ -138,6 +138,11 @@ class _Sampler:
         done: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         while low.size:
             off = self._deviation(low, high, piece)
+            if not np.all(np.isfinite(off)):
+                X = low[np.argmin(np.isfinite(off))]
+                raise ValueError(
+                    f"arm: got a shape or a path that is NaN near X = {X:.4g} m, need finite ones"
+                )
             wanted = np.ceil(np.sqrt(off / tolerance))
             parts = wanted.clip(1, _MOST_PARTS).astype(int)
             fine = parts == 1
