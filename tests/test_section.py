@@ -43,6 +43,15 @@ def test_tube_is_the_difference_of_two_circles():
         np.testing.assert_allclose(a, b - c, rtol=1e-14)
 
 
+def test_only_tubes_have_a_hole():
+    tube = vsr.Annular(0.02, vsr.Taper(0.015, 0.010))
+    assert vsr.Circular(0.02).inner_radius(X, L) == 0
+    np.testing.assert_allclose(tube.inner_radius(X, L), 0.015 - 0.005 * 0.4, rtol=1e-14)
+    for end, radius in ((0.2, 0.0), (0.4, 0.013)):
+        joined = vsr.Joined([end], [tube, vsr.Circular(0.02)])
+        np.testing.assert_allclose(joined.inner_radius(X, L), radius, rtol=1e-14)
+
+
 @pytest.mark.parametrize(
     ("ratio", "constant"),
     [(1.0, 0.1406), (1.5, 0.1958), (2.0, 0.2287), (3.0, 0.2633), (10.0, 0.3123)],

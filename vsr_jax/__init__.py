@@ -79,6 +79,7 @@ from .optimization import constraint, objective
 from .solution import Energy, Equilibrium, Error, Plan, SolveError, Summary, plan, solve
 
 if TYPE_CHECKING:
+    from .fabrication import Fabrication, export
     from .models.continuum import Continuum
     from .optimization.design_search import Design, design
     from .optimization.search import Search
@@ -102,6 +103,7 @@ __all__ = [
     "Energy",
     "Equilibrium",
     "Error",
+    "Fabrication",
     "Function",
     "FunctionBasis",
     "FunctionProfile",
@@ -154,6 +156,7 @@ __all__ = [
     "compliance_ellipsoid",
     "constraint",
     "design",
+    "export",
     "film",
     "follow",
     "follow_branch",
@@ -180,9 +183,11 @@ __all__ = [
 _LATER = {
     "Continuum": "models.continuum",
     "Design": "optimization.design_search",
+    "Fabrication": "fabrication",
     "Search": "optimization.search",
     "annotate": "viz.annotate",
     "design": "optimization.design_search",
+    "export": "fabrication",
     "film": "viz.animation",
     "plot": "viz.plot",
     "plot_design": "viz.plot_design",

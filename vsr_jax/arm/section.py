@@ -56,6 +56,10 @@ class Section(Part):
         """Points (y, z) [m] of the outer wall at X, a closed curve for `angle` [rad] from 0 (on the
         y axis) to 2 pi."""
 
+    def inner_radius(self, X: Scalar, length: Scalar) -> Scalar:
+        """Radius [m] of the central hole at X, 0 for a solid section."""
+        return jnp.zeros_like(X)
+
     @property
     @abstractmethod
     def sizes(self) -> dict[str, Profile]:
@@ -163,6 +167,9 @@ class Annular(Section):
     def outline(self, angle: Array, X: Scalar, length: Scalar) -> tuple[Array, Array]:
         r = self.outer(X, length)
         return r * jnp.cos(angle), r * jnp.sin(angle)
+
+    def inner_radius(self, X: Scalar, length: Scalar) -> Scalar:
+        return self.inner(X, length)
 
     @property
     def sizes(self) -> dict[str, Profile]:
@@ -311,6 +318,9 @@ class Joined(Section):
 
     def outline(self, angle: Array, X: Scalar, length: Scalar) -> tuple[Array, Array]:
         return pick(X, self.ends, [section.outline(angle, X, length) for section in self.sections])
+
+    def inner_radius(self, X: Scalar, length: Scalar) -> Scalar:
+        return pick(X, self.ends, [section.inner_radius(X, length) for section in self.sections])
 
     @property
     def sizes(self) -> dict[str, Profile]:

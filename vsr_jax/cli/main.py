@@ -9,6 +9,7 @@ from .. import __version__
 from .common import BAD_USAGE, EXIT_CODES
 from .compiling import compiling
 from .design_commands import add_design
+from .fabrication_commands import add_export
 from .inverse_commands import add_reach
 from .scene_commands import add_check, add_solve
 from .study_commands import add_accuracy, add_effects, add_paper
@@ -20,6 +21,7 @@ EXAMPLES = (
     "vsr-jax sweep scene.toml --samples 100000 --plot workspace.png",
     "vsr-jax reach scene.toml --target 0.5 0.1 0.2 --high 12",
     "vsr-jax design problem.toml --out designed.toml",
+    "vsr-jax export scene.toml --stl arm.stl --step arm.step --csv threads.csv",
     "vsr-jax paper --out results",
     "vsr-jax effects",
     "vsr-jax accuracy scene.toml",
@@ -69,6 +71,7 @@ def _parser() -> argparse.ArgumentParser:
     add_sweep(commands)
     add_reach(commands)
     add_design(commands)
+    add_export(commands)
     add_paper(commands)
     add_effects(commands)
     add_accuracy(commands)

@@ -102,8 +102,9 @@ def add_check(commands: Any) -> None:
     parser.add_argument("--json", metavar="FILE", help="save the report")
 
 
-def add_scene(parser: argparse.ArgumentParser) -> None:
-    """Adds the arguments for the scene, its inputs and the model."""
+def add_scene(parser: argparse.ArgumentParser, inputs: str = "those of the file") -> None:
+    """Adds the arguments for the scene, its inputs and the model; `inputs` describes the default
+    inputs."""
     parser.add_argument("scene", metavar="SCENE", help="the TOML file")
     parser.add_argument(
         "--inputs",
@@ -111,7 +112,7 @@ def add_scene(parser: argparse.ArgumentParser) -> None:
         metavar="U",
         nargs="*",
         type=float,
-        help="one number per actuator (default: those of the file)",
+        help=f"one number per actuator (default: {inputs})",
     )
     parser.add_argument(
         "--model",
