@@ -21,7 +21,10 @@ os.environ.setdefault("VSR_JAX_CACHE", "off")  # commands run here leave nothing
 import jaxtyping
 
 with jaxtyping.install_import_hook("vsr_jax", "beartype.beartype"):
-    import vsr_jax  # noqa: F401
+    import vsr_jax
+
+    for name in vsr_jax.__all__:  # the face imports its modules when their names are first used
+        getattr(vsr_jax, name)
 
 import jax
 import jax.numpy as jnp

@@ -27,7 +27,7 @@ from ..numerics.component import norm, split
 from ..numerics.se3 import rotation_vector
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
-from ..typing import Scalar, cast
+from ..typing import Pose, Scalar, cast
 from ..validation import instance, interval, is_traced, numbers, on_arm, positive, rigid
 
 _SAMPLES, _STARTS = 512, 6
@@ -55,6 +55,11 @@ class Reach(NamedTuple):
     miss: Scalar
     reached: Bool[Array, ""]
     allowed_miss: Scalar
+
+    @property
+    def tip(self) -> Pose:
+        """Pose of the tip for these inputs, shape (4, 4)."""
+        return self.equilibrium.tip
 
     def __str__(self) -> str:
         numbers = (self.inputs, self.miss, self.reached, self.allowed_miss)
