@@ -200,6 +200,30 @@ def test_a_wrong_case_is_one_line_and_exit_code_2(tmp_path, capsys):
     assert not (tmp_path / "new").exists()
 
 
+def test_the_help_lists_the_commands_without_importing_jax():
+    """With JAX it would take a second."""
+    code = (
+        "import sys; from vsr_jax.cli import main\n"
+        "try: main.main(['--help'])\n"
+        "except SystemExit: print([m for m in ('jax', 'equinox') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+    for name, command in cli.COMMANDS.items():
+        assert re.search(rf"^    {name} +{re.escape(command.help)}$", done.stdout, re.MULTILINE)
+        assert f"\n  {command.example}\n" in done.stdout
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_every_command_has_a_help(name, capsys):
+    with pytest.raises(SystemExit) as exit_:
+        cli.main([name, "--help"])
+    assert exit_.value.code == 0
+    text = capsys.readouterr().out
+    assert text.startswith(f"usage: vsr-jax {name} ")
+    assert "example:" in text
+
+
 def test_version(capsys):
     with pytest.raises(SystemExit) as exit_:
         cli.main(["--version"])

@@ -137,8 +137,9 @@ def test_the_command_designs_saves_and_draws(problem, tmp_path, capsys, monkeypa
     code = cli.main(
         ["design", str(problem), "--out", str(out), "--json", str(record), "--plot", str(picture)]
     )
-    said = capsys.readouterr().out
+    said, bar = capsys.readouterr()
     assert code == 0
+    assert bar.index("compiling:   0%") < bar.index("designing: 100%")
     assert "Inside(wall=0.001): satisfied" in said
     assert "actuators[0].routing.y = " in said
     kept, told = load(out), json.loads(record.read_text())

@@ -29,6 +29,7 @@ from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
 from ..typing import Pose, Scalar, cast
 from ..validation import instance, interval, is_traced, numbers, on_arm, positive, rigid
+from .progress import compiling, message_when_slow
 
 _SAMPLES, _STARTS = 512, 6
 """Random inputs, and the starts chosen among them."""
@@ -91,6 +92,7 @@ def reach(
     X: ArrayLike | Sequence | None = None,
     model: Model | None = None,
     allowed_miss: float | None = None,
+    progress: bool = True,
 ) -> Reach:
     """Inputs within bounds that bring the arm to a target, with the least effort among all that do.
 
@@ -107,6 +109,8 @@ def reach(
     - `allowed_miss` [m]: largest miss that counts as reached; by default 1e-4 of the length, in
       single precision 1e-3. It only affects `reached`; the inputs are those of the nearest point in
       any case.
+    - `progress`: whether to say on stderr that the program compiles, if that takes more than three
+      seconds.
 
     **Returns:** a `Reach`.
 
@@ -126,7 +130,8 @@ def reach(
         if allowed_miss is None
         else jnp.asarray(positive("allowed_miss", allowed_miss), aim.dtype)
     )
-    return _reach(_ReachProblem(scene, aim, stations, low, high, model), allowed)
+    with message_when_slow("vsr_jax.reach: compiling", start=False, shown=progress):
+        return _reach(_ReachProblem(scene, aim, stations, low, high, model), allowed)
 
 
 class _ReachProblem(NamedTuple):
@@ -203,6 +208,7 @@ def _check_bounds(
 
 @eqx.filter_jit
 def _reach(problem: _ReachProblem, allowed: Scalar) -> Reach:
+    compiling()
     tried = jnp.asarray(
         np.random.default_rng(0).uniform(size=(_SAMPLES, problem.low.size)), problem.low.dtype
     )

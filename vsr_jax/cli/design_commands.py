@@ -30,7 +30,6 @@ def add_design(commands: Commands) -> None:
     parser = command(
         commands,
         "design",
-        help="find routings, sizes and inputs by gradient descent",
         description="Finds numbers of a scene that minimise objectives under constraints, as "
         "specified by a problem file.",
         example="vsr-jax design problem.toml --out designed.toml --plot design.png",
@@ -65,6 +64,7 @@ def add_design(commands: Commands) -> None:
     )
     add_precision(parser)
     add_cache(parser)
+    parser.set_defaults(progress_bar=True)
 
 
 def _design(options: argparse.Namespace) -> int:

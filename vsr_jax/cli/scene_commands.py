@@ -66,7 +66,6 @@ def add_solve(commands: Any) -> None:
     parser = command(
         commands,
         "solve",
-        help="solve a scene file and print, draw or save the result",
         description="Solves the scene of a TOML file and prints status, tip, stability and "
         "threads.",
         example="vsr-jax solve scene.toml --inputs 8 2.5 --plot arm.png --json arm.json",
@@ -89,7 +88,6 @@ def add_check(commands: Any) -> None:
     parser = command(
         commands,
         "check",
-        help="report the health of the solve of a scene file",
         description="Solves the scene of a TOML file and 65 variants of it, 129 for a scene with "
         "inputs and loads. Prints the\n"
         "status, the stability margin, how far inputs and loads may grow and how the solve fails "

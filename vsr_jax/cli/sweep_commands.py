@@ -30,7 +30,6 @@ def add_sweep(commands: Any) -> None:
     parser = command(
         commands,
         "sweep",
-        help="solve a scene file for many inputs: its workspace",
         description="Draws inputs uniformly between two bounds, solves the scene of a TOML file "
         "for each, and prints the extent\n"
         "of the tip positions. The same command resumes an interrupted sweep to disk. The exit "
