@@ -3,27 +3,41 @@
 The package does not import this module on its own; use `from vsr_jax import plot`.
 """
 
+import textwrap
 from collections.abc import Sequence
 from typing import Any
 
-import jax
 import matplotlib.pyplot as plt
 import numpy as np
 from jax.typing import ArrayLike
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
-from matplotlib.ticker import MaxNLocator
+from matplotlib.lines import Line2D
 from matplotlib.typing import ColorType, LineStyleType
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 
+from ..arm.loads import Gravity
 from ..arm.rod import STRAINS
 from ..solution.equilibrium import Equilibrium
-from ..solution.summary import Summary, stations as checked_stations
+from ..solution.summary import Summary
 from ..typing import VectorLike
 from ..validation import choice
+from . import annotate
+from .body import body_of, draw_body, sample
+from .space import THINNEST_BOX, checked_space, equal_scale, fill, label_axes, world_frame
+from .style import COLORS, ink, shade, theme
+from .tendons import SLACK_DASHES, tension_bar, tension_scale
 
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""The palette of Okabe and Ito, which colour-blind readers can distinguish."""
+__all__ = [
+    "COLORS",
+    "LABELS",
+    "arm",
+    "equal_scale",
+    "sample",
+    "shade",
+    "strains",
+    "theme",
+    "workspace",
+]
 
 LABELS: dict[str, str] = dict(
     zip(
@@ -35,22 +49,10 @@ LABELS: dict[str, str] = dict(
 """Symbol and unit of each strain."""
 
 _LEAST_SPAN = 0.02
-_THINNEST_BOX = 0.35
-
-
-def sample(eq: Equilibrium, stations: VectorLike = 60) -> Summary:
-    """The summary of an equilibrium in NumPy arrays; `arm` and `strains` take it in place of `eq`.
-
-    **Arguments:** `stations`: number of stations, evenly spaced on the arm, or their abscissas [m].
-
-    **Raises:** `ValueError` for a batch of equilibria, for one that did not converge and for
-    stations beyond the arm.
-    """
-    if np.ndim(eq.status) > 0:
-        raise ValueError(f"eq: got a batch of shape {np.shape(eq.status)}, need one equilibrium")
-    if not bool(eq.converged):
-        raise ValueError(f"eq: got a solve that failed ({eq.message}), need a converged one")
-    return jax.tree.map(np.asarray, eq.summary(checked_stations(eq, stations, "stations")))
+_THINNEST = 0.2
+"""Least side of the box of a figure of its own, relative to the longest."""
+_AREA, _BAR = (0.02, 0.0, 0.86, 0.92), (0.9, 0.28, 0.018, 0.44)
+"""Rectangles of the box and of the colour bar in the figure."""
 
 
 def arm(
@@ -63,76 +65,72 @@ def arm(
     stations: VectorLike = 60,
     surface: bool = True,
     threads: bool = True,
+    details: bool | None = None,
     **line: Any,
 ) -> Axes3D:
-    """The deformed arm in 3D: its axis, its translucent outer wall and its threads, at equal scale.
+    """The deformed arm in 3D: its axis, its translucent outer wall or its discs, and its threads,
+    at equal scale.
+
+    With details, threads have the colour of their tension, with a colour bar (blue pushes,
+    vermilion pulls), and are dashed where they are slack; loads are arrows with a legend; the axes
+    of the world's frame and the direction of gravity are drawn. An arm too thin for its threads to
+    be told apart is drawn wider; the legend says by what factor.
+
+    Of a solve that failed, the arm at rest is drawn dimmed, with the message of the status.
 
     **Arguments:**
-    - `eq`: an equilibrium, or the result of `sample`.
+    - `eq`: an equilibrium, or the result of `sample`, which has no discs and no details.
     - `ax`: 3D axes; a new figure by default.
     - `color`, `label`, `linestyle`, `line`: matplotlib properties of the axis curve.
     - `stations`: number of stations, or their abscissas [m]; not used with a `Summary`.
-    - `surface`, `threads`: whether to draw the wall and the threads.
+    - `surface`, `threads`: whether to draw the wall with the discs, and the threads.
+    - `details`: by default those of an equilibrium in a new figure.
 
     **Returns:** the axes.
     """
-    samples = eq if isinstance(eq, Summary) else sample(eq, stations)
-    ax = plt.figure(figsize=(6, 5)).add_subplot(projection="3d") if ax is None else ax
-    if not isinstance(ax, Axes3D):
-        raise ValueError(
-            f"ax: got {type(ax).__name__}, need 3D axes, as from "
-            f"figure.add_subplot(projection='3d')"
-        )
-    if surface:
-        x, y, z = np.moveaxis(np.asarray(samples.wall), -1, 0)
-        ax.plot_surface(
-            x,
-            y,
-            z,
-            color=color,
-            alpha=0.18,
-            linewidth=0,
-            rstride=1,
-            cstride=1,
-            rasterized=True,
-        )
-    if threads:
-        for thread in samples.threads:
-            ax.plot(*thread.T, color=shade(color), linewidth=0.8)
-    ax.plot(*samples.position.T, color=color, label=label, linestyle=linestyle, **line)
-    ax.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
-    equal_scale(ax)
+    own, ax = ax is None, checked_space(ax)
+    body = body_of(eq, stations)
+    details = isinstance(eq, Equilibrium) and (own if details is None else details)
+    scale = None if body.tension is None or not details else tension_scale([body.tension])
+    widening = body.widening if details else 1.0
+    if body.failure is not None:
+        label = textwrap.fill(f"{label or 'the arm'} at rest; no equilibrium: {body.failure}", 80)
+    style = {"color": color, "linestyle": linestyle, "label": label, "scale": scale, **line}
+    draw_body(ax, body.widened(widening), surface=surface, threads=threads, **style)
+    if details and isinstance(eq, Equilibrium) and body.failure is None:
+        annotate.loads(eq, ax, legend=False)
+    label_axes(ax)
+    equal_scale(ax, thinnest=_THINNEST if own else THINNEST_BOX)
+    if own:
+        fill(ax, _AREA)
+    if details and isinstance(eq, Equilibrium):
+        world_frame(ax, _gravity(eq))
+    if details or body.failure is not None:
+        slack = threads and body.slack is not None and bool(np.any(body.slack))
+        _legend(ax, slack, widening, own)
+    if own and threads and scale is not None and np.any(body.tension):
+        tension_bar(ax, scale, body.tension, _BAR)
     return ax
 
 
-def equal_scale(ax: Axes3D, *, zoom: float = 1.1) -> None:
-    """Sets one scale for x, y and z: the box has the proportions of the data, with no side shorter
-    than about a third of the longest.
-
-    **Arguments:** `ax`: 3D axes; `zoom`: size of the box in them.
-    """
-    low = np.array([*ax.xy_dataLim.min, ax.zz_dataLim.x0])
-    high = np.array([*ax.xy_dataLim.max, ax.zz_dataLim.x1])
-    span = np.maximum(high - low, _THINNEST_BOX * np.max(high - low)) * 1.04
-    sides = zip(
-        *_around((low + high) / 2, span),
-        span / span.max(),
-        (ax.xaxis, ax.yaxis, ax.zaxis),
-        ("x", "y", "z"),
-        strict=True,
-    )
-    for start, end, width, axis, name in sides:
-        ticks = MaxNLocator(4 if width > 0.6 else 2, steps=[1, 2, 2.5, 4, 5, 10]).tick_values(
-            start, end
-        )
-        margin = 0.06 * (end - start)  # ticks at a corner would overlap those of the next side
-        axis.set_ticks(ticks[(ticks > start + margin) & (ticks < end - margin)])
-        ax.set(**{f"{name}lim": (start, end)})
-    ax.set_box_aspect(span, zoom=zoom)  # pyright: ignore[reportArgumentType] (its default is an int)
+def _gravity(eq: Equilibrium) -> np.ndarray | None:
+    """Sum of the accelerations of gravity [m/s^2], None without gravity."""
+    found = [load.acceleration for load in eq.scene.loads if isinstance(load, Gravity)]
+    return np.sum(np.asarray(found), axis=0) if found else None
 
 
-def _around(middle: np.ndarray, span: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return middle - span / 2, middle + span / 2
+def _legend(ax: Axes3D, slack: bool, widening: float, own: bool) -> None:
+    """Legend of what is drawn, slack tendons and the factor of the section, in the corner of the
+    figure or of the axes."""
+    handles = list(ax.get_legend_handles_labels()[0])
+    if slack:
+        handles.append(Line2D([], [], color=ink(0.6), linestyle=SLACK_DASHES, label="slack tendon"))
+    if widening > 1:
+        text = f"section drawn {widening:g} times as wide"
+        handles.append(Line2D([], [], linestyle="none", label=text))
+    if handles:
+        corner = {"bbox_to_anchor": (0.01, 0.99), "bbox_transform": ax.figure.transFigure}
+        ax.legend(handles=handles, loc="upper left", ncols=2, **(corner if own else {}))
 
 
 def strains(
@@ -238,8 +236,3 @@ def _corner() -> np.ndarray:
         [figure.add_subplot(2, 2, i + 1, projection="3d" if i == 0 else None) for i in range(4)],
         dtype=object,
     )
-
-
-def shade(color: ColorType) -> tuple[float, ...]:
-    """A darker shade of a colour, for lines drawn over it."""
-    return tuple(0.55 * part for part in to_rgb(color))
