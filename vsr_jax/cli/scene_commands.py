@@ -213,7 +213,7 @@ def _check(options: argparse.Namespace) -> int:
 def _tell(eq: Equilibrium, title: str, options: argparse.Namespace) -> None:
     from . import report
 
-    found = report.summary(eq, STATIONS) if options.plot or options.json else None
+    found = report.summary(eq, STATIONS) if options.json else None
     values = report.values(eq) if found is None else found.values
     error = options.tolerance is not None
     print("\n".join(report.lines(eq, values, title or options.scene, error=error)))
@@ -221,16 +221,21 @@ def _tell(eq: Equilibrium, title: str, options: argparse.Namespace) -> None:
         write_json(
             options.json, {"scene": options.scene, "title": title, **report.record(eq, found)}
         )
-    if options.plot and found is not None:
-        draw_without_display()
-        import matplotlib.pyplot as plt
+    if options.plot:
+        _draw(eq, title, options.plot)
+        if not bool(eq.converged):
+            said = "the solve failed, so it shows the arm at rest"
+            print(f"vsr-jax: {options.plot}: {said}", file=sys.stderr)
 
-        from ..viz import plot
 
-        plot.arm(found).set_title(title)
-        plt.savefig(options.plot, dpi=200, bbox_inches="tight")
-    elif options.plot:
-        print(f"vsr-jax: {options.plot} is not drawn: the solve failed", file=sys.stderr)
+def _draw(eq: Equilibrium, title: str, path: str) -> None:
+    draw_without_display()
+    from ..viz import plot
+
+    with plot.theme():
+        figure: Any = plot.arm(eq, stations=STATIONS).figure
+        figure.text(0.015, 0.02, title)
+        figure.savefig(path, dpi=200)
 
 
 def _model(name: str | None, steps: int | None, scene: Scene) -> Model | None:

@@ -122,6 +122,7 @@ def _draw(
         if 0 < np.sum(varied) < 4
         else None
     )
-    axes = plot.workspace(tips, values=share, label="mean share of the inputs' range")
-    axes[0].figure.suptitle(title)
-    axes[0].figure.savefig(Path(path), dpi=200)
+    with plot.theme():
+        axes = plot.workspace(tips, values=share, label="mean share of the inputs' range")
+        axes[0].figure.suptitle(title)
+        axes[0].figure.savefig(Path(path), dpi=200)

@@ -1,7 +1,7 @@
 """Annotations of an arm in 3D, drawn after `plot.arm`: frames of sections, arrows of loads,
 ellipsoids of the tip."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -135,7 +135,7 @@ def _wrench(load: Load, rod: Rod, X: Array, poses: np.ndarray) -> np.ndarray:
     if point is not None:
         wrench = np.asarray(jnp.stack(point[1]))[None]
     else:
-        wrench = np.asarray(jax.vmap(lambda x: jnp.stack(load.density(rod, x)))(X))
+        wrench = np.asarray(jax.vmap(lambda x: jnp.stack(load.density(rod, x) or ()))(X))
     if load.frame == "world":
         return wrench
     return np.einsum("xij,xkj->xki", poses[:, :3, :3], wrench.reshape(-1, 2, 3)).reshape(-1, 6)
@@ -144,8 +144,8 @@ def _wrench(load: Load, rod: Rod, X: Array, poses: np.ndarray) -> np.ndarray:
 def _draw_arrows(ax: Axes3D, row: Row, arrows: np.ndarray, color: ColorType | None) -> None:
     at_point = len(row.places) == 1
     color = (COLORS[3] if at_point else COLORS[4]) if color is None else color
-    style = {"color": color, "linewidth": 2.2 if at_point else 0.9}
-    dashes = {"linestyle": (0, (2, 1))} if row.moment else {}
+    style: dict[str, Any] = {"color": color, "linewidth": 2.2 if at_point else 0.9}
+    dashes: dict[str, Any] = {"linestyle": (0, (2, 1))} if row.moment else {}
     ax.quiver(*row.places.T, *arrows.T, arrow_length_ratio=0.25, **style, **dashes)
     if not at_point:
         ax.plot(*(row.places + arrows).T, **{**style, "linewidth": 0.6})

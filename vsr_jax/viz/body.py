@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.colors import Normalize
 from matplotlib.typing import ColorType
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from mpl_toolkits.mplot3d.axes3d import Axes3D
@@ -18,13 +17,13 @@ from ..solution.solver import solve
 from ..solution.summary import Summary, stations as checked_stations
 from ..typing import VectorLike
 from .style import ink, shade
-from .tendons import draw_threads, is_slack
+from .tendons import TensionScale, draw_threads, is_slack
 
 _DISCS = 13
 _ANGLES = np.linspace(0.0, 2 * np.pi, 33)
 
-_THIN = 0.02
-"""Radius of an arm relative to its extent below which its section is drawn wider."""
+_THIN, _DRAWN = 0.01, 0.03
+"""Radius of an arm relative to its extent below which its section is drawn wider, and how wide."""
 
 
 def sample(eq: Equilibrium, stations: VectorLike = 60) -> Summary:
@@ -77,7 +76,8 @@ class Body(NamedTuple):
         if self.discs.size:
             middle = self.discs.mean(axis=1, keepdims=True)
             radius = max(radius, np.max(np.linalg.norm(self.discs - middle, axis=-1)))
-        return max(1.0, float(f"{_THIN * np.max(np.ptp(axis, axis=0)) / radius:.2g}"))
+        extent = np.max(np.ptp(axis, axis=0))
+        return float(f"{_DRAWN * extent / radius:.2g}") if radius < _THIN * extent else 1.0
 
 
 def body_of(eq: Equilibrium | Summary, stations: VectorLike = 60) -> Body:
@@ -118,7 +118,7 @@ def draw_body(
     color: ColorType,
     surface: bool = True,
     threads: bool = True,
-    scale: Normalize | None = None,
+    scale: TensionScale | None = None,
     **line: Any,
 ) -> None:
     """The wall with the discs, the threads and the axis of an arm.
@@ -137,9 +137,11 @@ def draw_body(
             rims = Poly3DCollection(body.discs, facecolors=[color], edgecolors=[color], alpha=0.2)
             ax.add_collection3d(rims, autolim=False)
             ax.auto_scale_xyz(*body.discs.reshape(-1, 3).T, had_data=True)
-    if threads and (scale is None or body.tension is None or body.slack is None):
-        for thread in body.samples.threads:
-            ax.plot(*thread.T, color=shade(color), linewidth=0.8)
+    paths = np.asarray(body.samples.threads)[: None if threads else 0]
+    if scale is None or body.tension is None or body.slack is None:
+        for path in paths:
+            ax.plot(*path.T, color=shade(color), linewidth=0.8)
     elif threads:
-        draw_threads(ax, body.samples.threads, body.tension, body.slack, scale)
-    ax.plot(*body.samples.position.T, color=color, **line)
+        draw_threads(ax, paths, body.tension, body.slack, scale)
+    width: dict[str, Any] = {} if scale is None else {"linewidth": 0.8}
+    ax.plot(*body.samples.position.T, color=color, **(width | line))

@@ -11,6 +11,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from jax.typing import ArrayLike
 from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
+from matplotlib.colors import LogNorm
 from matplotlib.lines import Line2D
 from matplotlib.typing import ColorType, LineStyleType
 from mpl_toolkits.mplot3d.axes3d import Axes3D
@@ -23,7 +25,15 @@ from ..typing import VectorLike
 from ..validation import choice
 from . import annotate
 from .body import body_of, draw_body, sample
-from .space import THINNEST_BOX, checked_space, equal_scale, fill, label_axes, world_frame
+from .space import (
+    THINNEST_BOX,
+    checked_space,
+    equal_scale,
+    fill,
+    fit_height,
+    label_axes,
+    world_frame,
+)
 from .style import COLORS, ink, shade, theme
 from .tendons import SLACK_DASHES, tension_bar, tension_scale
 
@@ -51,15 +61,22 @@ LABELS: dict[str, str] = dict(
 _LEAST_SPAN = 0.02
 _THINNEST = 0.2
 """Least side of the box of a figure of its own, relative to the longest."""
-_AREA, _BAR = (0.02, 0.0, 0.86, 0.92), (0.9, 0.28, 0.018, 0.44)
+_AREA, _BAR = (0.0, 0.0, 0.87, 0.9), (0.885, 0.25, 0.018, 0.5)
 """Rectangles of the box and of the colour bar in the figure."""
+
+_PAIRS = ((0, 1), (0, 2), (1, 2))
+"""Horizontal and vertical axis of each projection of a workspace."""
+_CELLS = (20, 60)
+"""Least and greatest number of cells along the longest side of a workspace."""
+_CLOUD, _CLOUD_BAR = (0.0, 0.5, 0.42, 0.48), (0.9, 0.25, 0.016, 0.5)
+"""Rectangles of the 3D axes and of the colour bar of a workspace in its figure."""
 
 
 def arm(
     eq: Equilibrium | Summary,
     ax: Axes3D | None = None,
     *,
-    color: ColorType = COLORS[0],
+    color: ColorType | None = None,
     label: str | None = None,
     linestyle: LineStyleType = "-",
     stations: VectorLike = 60,
@@ -81,7 +98,8 @@ def arm(
     **Arguments:**
     - `eq`: an equilibrium, or the result of `sample`, which has no discs and no details.
     - `ax`: 3D axes; a new figure by default.
-    - `color`, `label`, `linestyle`, `line`: matplotlib properties of the axis curve.
+    - `color`, `label`, `linestyle`, `line`: matplotlib properties of the axis curve; the colour is
+      that of the wall too, by default blue, and grey with details.
     - `stations`: number of stations, or their abscissas [m]; not used with a `Summary`.
     - `surface`, `threads`: whether to draw the wall with the discs, and the threads.
     - `details`: by default those of an equilibrium in a new figure.
@@ -94,22 +112,23 @@ def arm(
     scale = None if body.tension is None or not details else tension_scale([body.tension])
     widening = body.widening if details else 1.0
     if body.failure is not None:
-        label = textwrap.fill(f"{label or 'the arm'} at rest; no equilibrium: {body.failure}", 80)
-    style = {"color": color, "linestyle": linestyle, "label": label, "scale": scale, **line}
+        label = textwrap.fill(f"{label or 'the arm'} at rest; no equilibrium: {body.failure}", 70)
+    shown = color if color is not None else ink(0.5) if details else COLORS[0]
+    style = {"color": shown, "linestyle": linestyle, "label": label, "scale": scale, **line}
     draw_body(ax, body.widened(widening), surface=surface, threads=threads, **style)
     if details and isinstance(eq, Equilibrium) and body.failure is None:
         annotate.loads(eq, ax, legend=False)
     label_axes(ax)
     equal_scale(ax, thinnest=_THINNEST if own else THINNEST_BOX)
     if own:
-        fill(ax, _AREA)
+        fit_height(ax, _AREA)
     if details and isinstance(eq, Equilibrium):
         world_frame(ax, _gravity(eq))
     if details or body.failure is not None:
         slack = threads and body.slack is not None and bool(np.any(body.slack))
         _legend(ax, slack, widening, own)
-    if own and threads and scale is not None and np.any(body.tension):
-        tension_bar(ax, scale, body.tension, _BAR)
+    if own and threads and scale is not None:
+        tension_bar(ax, scale, _BAR)
     return ax
 
 
@@ -130,7 +149,12 @@ def _legend(ax: Axes3D, slack: bool, widening: float, own: bool) -> None:
         handles.append(Line2D([], [], linestyle="none", label=text))
     if handles:
         corner = {"bbox_to_anchor": (0.01, 0.99), "bbox_transform": ax.figure.transFigure}
-        ax.legend(handles=handles, loc="upper left", ncols=2, **(corner if own else {}))
+        ax.legend(
+            handles=handles,
+            loc="upper left",
+            ncols=1 + (len(handles) > 2),
+            **(corner if own else {}),
+        )
 
 
 def strains(
@@ -159,7 +183,8 @@ def strains(
     """
     indices = [STRAINS.index(choice("names", name, STRAINS)) for name in names]
     samples = eq if isinstance(eq, Summary) else sample(eq, stations)
-    axes = _panels(len(indices)) if ax is None else np.asarray(ax, dtype=object).reshape(-1)
+    own = ax is None
+    axes = _panels(len(indices)) if own else np.asarray(ax, dtype=object).reshape(-1)
     if len(axes) != len(indices):
         raise ValueError(f"ax: got {len(axes)} axes, need {len(indices)}, one per name")
     for panel, name, index in zip(axes, names, indices, strict=True):
@@ -173,8 +198,11 @@ def strains(
         )
         panel.set(xlabel="X [m]", ylabel=LABELS[name], xlim=(samples.X.min(), samples.X.max()))
         panel.ticklabel_format(axis="y", useOffset=False)
+        if own:
+            panel.set_title(name.replace("_", " about " if "bending" in name else " along "))
         low, high = panel.dataLim.intervaly
-        panel.set_ylim(*_around((low + high) / 2, max(1.12 * (high - low), _LEAST_SPAN)))
+        middle, half = (low + high) / 2, max(1.12 * (high - low), _LEAST_SPAN) / 2
+        panel.set_ylim(middle - half, middle + half)
     return axes
 
 
@@ -204,35 +232,70 @@ def workspace(
     - `positions`: shape (samples, 3) [m]; rows with a NaN are left out.
     - `ax`: four axes, the first one 3D; a new figure by default.
     - `values`, `label`: one number per point that sets its colour, and the label of the colour bar;
-      without `values` all points have the colour `color`.
+      without `values` the projections show the density: the number of tips in each cell, of all
+      points.
+    - `color`: of the points in space without `values`.
     - `most`: maximum number of points drawn; larger sets are subsampled evenly.
 
     **Returns:** the axes: 3D, then y over x, z over x, z over y.
+
+    **Raises:** `ValueError` for positions of another shape, and without any finite one.
     """
     positions = np.asarray(positions)
     if positions.ndim != 2 or positions.shape[1] != 3:
         raise ValueError(f"positions: got shape {positions.shape}, need (samples, 3)")
-    shown = np.flatnonzero(np.all(np.isfinite(positions), axis=1))
-    shown = shown[:: -(-len(shown) // most) or 1]
+    finite = np.flatnonzero(np.all(np.isfinite(positions), axis=1))
+    if not finite.size:
+        raise ValueError("positions: got no finite row, need at least one")
+    shown = finite[:: -(-len(finite) // most)]
     axes = _corner() if ax is None else np.asarray(ax, dtype=object).reshape(-1)
-    points = positions[shown].T
-    style: dict[str, Any] = {"s": 2, "linewidths": 0, "rasterized": True}
-    style |= {"c": color} if values is None else {"c": np.asarray(values)[shown], "cmap": "viridis"}
-    cloud = axes[0].scatter(*points, alpha=0.5, **style)
-    axes[0].set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+    style: dict[str, Any] = {"s": 3, "linewidths": 0, "rasterized": True}
+    style |= {"c": color} if values is None else {"c": np.asarray(values)[shown]}
+    points = axes[0].scatter(*positions[shown].T, alpha=0.5, **style)
+    label_axes(axes[0])
     equal_scale(axes[0])
-    for panel, (i, j) in zip(axes[1:], ((0, 1), (0, 2), (1, 2)), strict=True):
-        panel.scatter(points[i], points[j], **style)
+    if ax is None:
+        fill(axes[0], _CLOUD)
+    for panel, (i, j) in zip(axes[1:], _PAIRS, strict=True):
+        if values is not None:
+            panel.scatter(positions[shown, i], positions[shown, j], **style)
         panel.set(xlabel=f"{'xyz'[i]} [m]", ylabel=f"{'xyz'[j]} [m]")
-        panel.set_aspect("equal", adjustable="box")
-    if values is not None:
-        axes[0].figure.colorbar(cloud, ax=list(axes), label=label, shrink=0.6).solids.set_alpha(1)
+        panel.set_aspect("equal", adjustable="datalim" if ax is None else "box")
+        panel.margins(0.05)
+        panel.locator_params(nbins=5)
+    if values is None:
+        points = _draw_density(axes[1:], positions[finite])
+    figure, text = axes[0].figure, "tips per cell" if values is None else label
+    place = (
+        {"cax": figure.add_axes(_CLOUD_BAR)} if ax is None else {"ax": list(axes), "shrink": 0.6}
+    )
+    figure.colorbar(points, label=text, **place).solids.set_alpha(1)
     return axes
 
 
 def _corner() -> np.ndarray:
-    figure = plt.figure(figsize=(9, 7), layout="constrained")
-    return np.array(
-        [figure.add_subplot(2, 2, i + 1, projection="3d" if i == 0 else None) for i in range(4)],
-        dtype=object,
-    )
+    figure = plt.figure(figsize=(8.6, 6.8))
+    grid = figure.add_gridspec(2, 2, left=0.09, right=0.86, bottom=0.08, top=0.96, wspace=0.28)
+    space = figure.add_subplot(grid[0], projection="3d")
+    space.view_init(22, -60)
+    panels = [figure.add_subplot(grid[i]) for i in (1, 2, 3)]
+    return np.array([space, *panels], dtype=object)
+
+
+def _draw_density(panels: Sequence[Axes] | np.ndarray, tips: np.ndarray) -> QuadMesh:
+    """Number of tips in each cell of the projections, on one logarithmic scale."""
+    cells = np.clip(np.sqrt(len(tips)) / 2, *_CELLS)
+    cell = np.max(np.ptp(tips, axis=0)) / cells or 1.0
+    ends = zip(tips.min(axis=0), tips.max(axis=0), strict=True)
+    edges = [np.arange(low - cell, high + 2 * cell, cell) for low, high in ends]
+    counts = [
+        np.histogram2d(tips[:, i], tips[:, j], bins=[edges[i], edges[j]])[0] for i, j in _PAIRS
+    ]
+    scale = LogNorm(1, max(2, *(np.max(count) for count in counts)))
+    meshes = [
+        panel.pcolormesh(
+            edges[i], edges[j], np.ma.masked_equal(count.T, 0), norm=scale, rasterized=True
+        )
+        for panel, (i, j), count in zip(panels, _PAIRS, counts, strict=True)
+    ]
+    return meshes[0]

@@ -1,5 +1,7 @@
 """Axes in space: one scale, a view that fits the data, the world's frame."""
 
+from typing import Any
+
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.ticker import MaxNLocator
@@ -13,8 +15,12 @@ THINNEST_BOX = 0.35
 FRAME_COLORS = (COLORS[1], COLORS[2], COLORS[0])
 """Colours of the axes x, y and z of a frame."""
 
-_LABEL_ROOM = 0.62
+_LABEL_ROOM = 0.55
 """Room for ticks and labels around a box [inches]."""
+_TICK_DISTANCES, _LABEL_DISTANCES, _TICK_ROOM = (11.0, 13.0, 18.0), (27.0, 30.0, 40.0), 38.0
+"""Distances of tick labels and axis labels from the axes x, y, z, and between ticks [points]."""
+_TICK_OFFSET, _LABEL_OFFSET, _PAD_UNIT = 8.0, 21.0, 0.08 * 48
+"""Matplotlib's: a pad p moves a label by (p + offset) unit sides / points of the axes."""
 
 
 def new_space(figsize: tuple[float, float] = (6.4, 4.8)) -> Axes3D:
@@ -54,26 +60,52 @@ def equal_scale(ax: Axes3D, *, zoom: float = 1.1, thinnest: float = THINNEST_BOX
     low = np.array([*ax.xy_dataLim.min, ax.zz_dataLim.x0])
     high = np.array([*ax.xy_dataLim.max, ax.zz_dataLim.x1])
     span = np.maximum(high - low, thinnest * np.max(high - low)) * 1.04
-    middle = (low + high) / 2
-    sides = zip(
-        middle - span / 2,
-        middle + span / 2,
-        span / span.max(),
-        (ax.xaxis, ax.yaxis, ax.zaxis),
-        ("x", "y", "z"),
-        strict=True,
-    )
-    for start, end, width, axis, name in sides:
-        ticks = MaxNLocator(4 if width > 0.6 else 2, steps=[1, 2, 2.5, 4, 5, 10]).tick_values(
-            start, end
-        )
-        margin = 0.06 * (end - start)  # ticks at a corner would overlap those of the next side
-        axis.set_ticks(ticks[(ticks > start + margin) & (ticks < end - margin)])
-        ax.set(**{f"{name}lim": (start, end)})
+    start, end = (low + high - span) / 2, (low + high + span) / 2
+    ax.set(**{f"{name}lim": ends for name, *ends in zip("xyz", start, end, strict=True)})
     ax.set_box_aspect(span, zoom=zoom)  # pyright: ignore[reportArgumentType] (its default is an int)
+    _set_ticks(ax)
 
 
-def limits(ax: Axes3D) -> tuple[np.ndarray, np.ndarray]:
+def _set_ticks(ax: Axes3D) -> None:
+    """Ticks as many as there is room for, none at a corner, and labels beside them.
+
+    Matplotlib measures the distances of tick labels and axis labels from an axis in sides of the
+    box: in a thin box they would lie on each other. The distances set here are those of a cube.
+    """
+    low, high = limits(ax)
+    azimuth, elevation = np.radians([ax.azim, ax.elev])
+    x, y = np.where(np.array([np.cos(azimuth), np.sin(azimuth)]) < 0, -1.0, 1.0)
+    z = -1.0 if elevation >= 0 else 1.0
+    outward = np.array([[0, y, z], [x, 0, z], [x, -y, 0]])  # from the centre to each axis
+    points_per_pixel = 72 / ax.figure.dpi
+    axes: tuple[Any, ...] = (ax.xaxis, ax.yaxis, ax.zaxis)
+    for i, axis in enumerate(axes):
+        middle = (low + high + outward[i] * (high - low)) / 2
+        along = 0.5 * np.eye(3)[i] * (high - low)
+        unit = outward[i] * (high - low) * _PAD_UNIT / _points(ax)
+        ends = _pixels(ax, np.stack([middle - along, middle + along, middle, middle + unit]))
+        length, step = (points_per_pixel * np.linalg.norm(ends[j + 1] - ends[j]) for j in (0, 2))
+        number = int(np.clip(length / _TICK_ROOM, 1, 4))
+        locator = MaxNLocator(number, steps=[1, 2, 2.5, 4, 5, 10])
+        ticks, margin = locator.tick_values(low[i], high[i]), 0.06 * (high[i] - low[i])
+        ticks = ticks[(ticks > low[i] + margin) & (ticks < high[i] - margin)]
+        axis.set_ticks(ticks[len(ticks) // 2 :][:1] if number == 1 else ticks)
+        axis.set_tick_params(pad=_TICK_DISTANCES[i] / step - _TICK_OFFSET)
+        axis.labelpad = _LABEL_DISTANCES[i] / step - _LABEL_OFFSET
+
+
+def _pixels(ax: Axes3D, points: np.ndarray) -> np.ndarray:
+    """Points [m] as pixels of the figure, shape (points, 2)."""
+    x, y, _ = proj3d.proj_transform(points[:, 0], points[:, 1], points[:, 2], ax.get_proj())
+    return ax.transData.transform(np.transpose([x, y]))
+
+
+def _points(ax: Axes3D) -> float:
+    """Half the circumference of the axes [points]."""
+    return 72.0 / ax.figure.dpi * float(np.sum(ax.bbox.size))
+
+
+def limits(ax: Any) -> tuple[np.ndarray, np.ndarray]:
     """Least and greatest corner of the box [m]."""
     low, high = np.transpose([ax.get_xlim3d(), ax.get_ylim3d(), ax.get_zlim3d()])
     return low, high
@@ -88,21 +120,34 @@ def fill(ax: Axes3D, rectangle: tuple[float, float, float, float]) -> None:
     the figure.
     """
     low, high = limits(ax)
-    corners = np.array(np.meshgrid(*np.transpose([low, high]), indexing="ij")).reshape(3, 8)
-    size = np.array(ax.figure.get_size_inches())  # pyright: ignore[reportAttributeAccessIssue]
+    corners = np.array(np.meshgrid(*np.transpose([low, high]), indexing="ij")).reshape(3, 8).T
+    figure = ax.figure
+    size = np.array(figure.get_size_inches())  # pyright: ignore[reportAttributeAccessIssue]
     corner, extent = np.array(rectangle[:2]), np.array(rectangle[2:])
     middle, room = (corner + extent / 2) * size, extent * size - 2 * _LABEL_ROOM
-    side, zoom = np.max(extent * size), 1.0
-    centre = middle
-    for _ in range(3):
+    side, zoom, centre = np.max(extent * size), 1.0, middle
+    for _ in range(4):
         ax.set_position((*((centre - side / 2) / size), *(side / size)))
         ax.set_box_aspect(high - low, zoom=zoom)  # pyright: ignore[reportArgumentType]
-        x, y, _ = proj3d.proj_transform(*corners, ax.get_proj())
-        drawn = ax.transData.transform(np.transpose([x, y])) / ax.figure.dpi
+        drawn = _pixels(ax, corners) / figure.dpi
         least, most = drawn.min(axis=0), drawn.max(axis=0)
         centre = centre + middle - (least + most) / 2
         zoom *= float(np.min(room / (most - least)))
-    ax.set_position((*((centre - side / 2) / size), *(side / size)))
+    _set_ticks(ax)
+
+
+def fit_height(ax: Axes3D, rectangle: tuple[float, float, float, float]) -> None:
+    """`fill`, in a figure as high as the box needs, between half its width and its width."""
+    fill(ax, rectangle)
+    low, high = limits(ax)
+    corners = np.array(np.meshgrid(*np.transpose([low, high]), indexing="ij")).reshape(3, 8).T
+    figure = ax.figure
+    drawn = np.ptp(_pixels(ax, corners), axis=0) / figure.dpi
+    width = figure.get_size_inches()[0]  # pyright: ignore[reportAttributeAccessIssue]
+    wide = rectangle[2] * width - 2 * _LABEL_ROOM
+    needed = (drawn[1] * wide / drawn[0] + 2 * _LABEL_ROOM) / rectangle[3]
+    figure.set_size_inches(width, np.clip(needed, 0.5 * width, 0.8 * width))  # pyright: ignore[reportAttributeAccessIssue]
+    fill(ax, rectangle)
 
 
 def world_frame(ax: Axes3D, gravity: np.ndarray | None = None) -> None:
@@ -127,4 +172,5 @@ def _arrow(ax: Axes3D, start: np.ndarray, along: np.ndarray, color: object, name
     head = [[tip, tip - 0.25 * along + sign * across] for sign in (-1, 1)]
     lines = Line3DCollection([[start, tip], *head], colors=[color], linewidths=1.4)
     ax.add_artist(lines)
-    ax.text(*(start + 1.25 * along), name, color=color, ha="center", va="center", fontsize=8)
+    x, y, z = start + 1.5 * along
+    ax.text(x, y, z, name, color=color, ha="center", va="center", fontsize=8)

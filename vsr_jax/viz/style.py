@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from typing import Any, Literal
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.colors import LinearSegmentedColormap, to_rgb
 from matplotlib.typing import ColorType
 
@@ -19,6 +20,7 @@ TENSION = LinearSegmentedColormap.from_list("tension", ["#0072B2", "#9a9a9a", "#
 pulls. Its grey is visible on both themes."""
 
 Theme = Literal["light", "dark"]
+RGB = tuple[float, float, float]
 
 _SHARED: dict[str, Any] = {
     "font.size": 9.0,
@@ -41,7 +43,7 @@ _THEMES: dict[Theme, tuple[str, str, str]] = {
 """Background, ink and grid lines."""
 
 
-def settings(name: Theme = "light") -> dict[str, Any]:
+def settings(name: Theme = "light") -> dict[Any, Any]:
     """Settings of matplotlib (`rcParams`) of a theme."""
     paper, ink, grid = _THEMES[choice("theme", name, tuple(_THEMES))]
     pane = mixed(paper, ink, 0.03)
@@ -63,18 +65,18 @@ def theme(name: Theme = "light") -> Iterator[None]:
         yield
 
 
-def ink(strength: float = 1.0) -> tuple[float, ...]:
+def ink(strength: float = 1.0) -> RGB:
     """Colour of text in the current style, or its mixture with the background, which is 0."""
     paper = mpl.rcParams["axes.facecolor"]
     return mixed(paper, mpl.rcParams["text.color"], strength)
 
 
-def mixed(first: ColorType, second: ColorType, share: float) -> tuple[float, ...]:
+def mixed(first: ColorType, second: ColorType, share: float) -> RGB:
     """Mixture of two colours; `share` is that of the second."""
-    pairs = zip(to_rgb(first), to_rgb(second), strict=True)
-    return tuple((1 - share) * a + share * b for a, b in pairs)
+    red, green, blue = (1 - share) * np.array(to_rgb(first)) + share * np.array(to_rgb(second))
+    return float(red), float(green), float(blue)
 
 
-def shade(color: ColorType) -> tuple[float, ...]:
+def shade(color: ColorType) -> RGB:
     """A shade of a colour for lines drawn over it: nearer to the colour of text."""
     return mixed(color, mpl.rcParams["text.color"], 0.45)
