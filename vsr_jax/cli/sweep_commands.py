@@ -92,9 +92,13 @@ def _sweep(options: argparse.Namespace) -> int:
     tips = np.asarray(result["tip"])[:, :3, 3]
     print("\n".join(_lines(task.title or options.scene, low, high, result, tips)))
     print(f"time        {seconds:.1f} s, including compilation")
+    if not np.any(result.converged):
+        if options.plot:
+            print(f"vsr-jax: {options.plot} is not drawn: no sample converged", file=sys.stderr)
+        return NOT_CONVERGED
     if options.plot:
         _draw(options.plot, task.title, tips, inputs, low, high)
-    return DONE if np.any(result.converged) else NOT_CONVERGED
+    return DONE
 
 
 def _lines(

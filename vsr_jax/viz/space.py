@@ -17,7 +17,7 @@ FRAME_COLORS = (COLORS[1], COLORS[2], COLORS[0])
 
 _LABEL_ROOM = 0.55
 """Room for ticks and labels around a box [inches]."""
-_TICK_DISTANCES, _LABEL_DISTANCES, _TICK_ROOM = (11.0, 13.0, 18.0), (27.0, 30.0, 40.0), 38.0
+_TICK_DISTANCES, _LABEL_DISTANCES, _TICK_ROOM = (11.0, 13.0, 18.0), (28.0, 34.0, 46.0), 38.0
 """Distances of tick labels and axis labels from the axes x, y, z, and between ticks [points]."""
 _TICK_OFFSET, _LABEL_OFFSET, _PAD_UNIT = 8.0, 21.0, 0.08 * 48
 """Matplotlib's: a pad p moves a label by (p + offset) unit sides / points of the axes."""
@@ -47,7 +47,11 @@ def checked_space(ax: Axes3D | None) -> Axes3D:
 
 
 def label_axes(ax: Axes3D) -> None:
-    """Labels of a position in space."""
+    """Labels of a position in space, upright."""
+    axes: tuple[Any, ...] = (ax.xaxis, ax.yaxis, ax.zaxis)
+    for axis in axes:
+        axis.set_rotate_label(False)
+        axis.label.set_rotation(0)
     ax.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
 
 
