@@ -15,9 +15,9 @@ THINNEST_BOX = 0.35
 FRAME_COLORS = (COLORS[1], COLORS[2], COLORS[0])
 """Colours of the axes x, y and z of a frame."""
 
-_LABEL_ROOM = 0.55
+_LABEL_ROOM = 0.62
 """Room for ticks and labels around a box [inches]."""
-_TICK_DISTANCES, _LABEL_DISTANCES, _TICK_ROOM = (11.0, 13.0, 18.0), (28.0, 34.0, 46.0), 38.0
+_TICK_DISTANCES, _LABEL_DISTANCES, _TICK_ROOM = (11.0, 13.0, 18.0), (34.0, 38.0, 46.0), 38.0
 """Distances of tick labels and axis labels from the axes x, y, z, and between ticks [points]."""
 _TICK_OFFSET, _LABEL_OFFSET, _PAD_UNIT = 8.0, 21.0, 0.08 * 48
 """Matplotlib's: a pad p moves a label by (p + offset) unit sides / points of the axes."""
