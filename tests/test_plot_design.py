@@ -174,7 +174,7 @@ def test_a_film_has_a_frame_for_each_arm(eq, tmp_path):
 def test_a_film_keeps_the_last_shape_where_a_solve_failed(eq, tmp_path):
     bare = vsr.Scene(eq.scene.rod, eq.scene.actuators)
     fine, failed = (vsr.solve(bare, [tension], model=MODEL) for tension in (1.0, 1e6))
-    moving = film([fine, failed], titles=["one", "two"])
+    moving = film([fine, failed], tmp_path / "arm.gif", titles=["one", "two"], dpi=30)
     moving._func(1)
     axes = moving._fig.axes[0]
     assert moving._fig.get_suptitle() == "two: no equilibrium"

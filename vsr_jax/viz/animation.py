@@ -17,7 +17,7 @@ from .space import equal_scale, fit_height, label_axes, new_space, world_frame
 from .style import COLORS, ink
 from .tendons import tension_bar, tension_scale
 
-_AREA, _BAR = (0.0, 0.0, 0.87, 0.9), (0.885, 0.25, 0.018, 0.5)
+_AREA, _BAR = (0.0, 0.0, 0.83, 0.9), (0.885, 0.25, 0.018, 0.5)
 """Rectangles of the box and of the colour bar in the figure."""
 _STATIONS = 40
 

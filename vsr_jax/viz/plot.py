@@ -61,7 +61,7 @@ LABELS: dict[str, str] = dict(
 _LEAST_SPAN = 0.02
 _THINNEST = 0.2
 """Least side of the box of a figure of its own, relative to the longest."""
-_AREA, _BAR = (0.0, 0.0, 0.87, 0.9), (0.885, 0.25, 0.018, 0.5)
+_AREA, _BAR = (0.0, 0.0, 0.83, 0.9), (0.885, 0.25, 0.018, 0.5)
 """Rectangles of the box and of the colour bar in the figure."""
 
 _PAIRS = ((0, 1), (0, 2), (1, 2))
@@ -125,7 +125,8 @@ def arm(
     if details and isinstance(eq, Equilibrium):
         world_frame(ax, _gravity(eq))
     if details or body.failure is not None:
-        slack = threads and body.slack is not None and bool(np.any(body.slack))
+        loose = body.slack if threads and body.failure is None else None
+        slack = loose is not None and bool(np.any(loose))
         _legend(ax, slack, widening, own)
     if own and threads and scale is not None:
         tension_bar(ax, scale, _BAR)
