@@ -288,7 +288,8 @@ def _draw_density(panels: Sequence[Axes] | np.ndarray, tips: np.ndarray) -> Quad
     cells = np.clip(np.sqrt(len(tips)) / 2, *_CELLS)
     cell = np.max(np.ptp(tips, axis=0)) / cells or 1.0
     ends = zip(tips.min(axis=0), tips.max(axis=0), strict=True)
-    edges = [np.arange(low - cell, high + 2 * cell, cell) for low, high in ends]
+    # the outermost tips lie in the middle of a cell, where rounding does not move them to another
+    edges = [np.arange(low - cell / 2, high + cell, cell) for low, high in ends]
     counts = [
         np.histogram2d(tips[:, i], tips[:, j], bins=[edges[i], edges[j]])[0] for i, j in _PAIRS
     ]
