@@ -262,6 +262,7 @@ def workspace(
             panel.scatter(positions[shown, i], positions[shown, j], **style)
         panel.set(xlabel=f"{'xyz'[i]} [m]", ylabel=f"{'xyz'[j]} [m]")
         panel.set_aspect("equal", adjustable="datalim" if ax is None else "box")
+        panel.use_sticky_edges = False
         panel.margins(0.05)
         panel.locator_params(nbins=5)
     if values is None:
