@@ -56,7 +56,7 @@ def follow_the_s() -> tuple[vsr.Design, dict[str, Any]]:
     start = time.perf_counter()
     free = {"actuators[0].routing.y": (-0.01, 0.01), "inputs": (0.5, 40.0)}
     found = vsr.design(
-        arm(0.0),
+        arm(0.004),
         free,
         vsr.objective.CurveError(s_curve(20)),
         [[5.0]],

@@ -21,7 +21,10 @@ os.environ.setdefault("VSR_JAX_CACHE", "off")  # commands run here leave nothing
 import jaxtyping
 
 with jaxtyping.install_import_hook("vsr_jax", "beartype.beartype"):
-    import vsr_jax  # noqa: F401
+    import vsr_jax
+
+    for name in vsr_jax.__all__:  # the face imports its modules when their names are first used
+        getattr(vsr_jax, name)
 
 import jax
 import jax.numpy as jnp
@@ -35,11 +38,11 @@ jax.config.update("jax_enable_x64", True)
 gc.freeze()
 gc.set_threshold(200_000, 50, 1000)
 
-from vsr_jax.cli import compiling  # noqa: E402
+from vsr_jax.analysis import progress  # noqa: E402
 from vsr_jax.studies import paper  # noqa: E402
 
 # On a slow machine commands would say that they compile wherever a test reads what they print.
-compiling.SILENT = 1e6
+progress.SILENT = 1e6
 
 
 def epsilon(dtype) -> float:

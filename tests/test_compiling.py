@@ -6,9 +6,12 @@ import subprocess
 import sys
 import time
 
+import jax
+import numpy as np
 import pytest
 
 import vsr_jax as vsr
+from vsr_jax.analysis import progress
 from vsr_jax.cli import compiling
 from vsr_jax.studies import paper
 
@@ -64,7 +67,34 @@ def test_a_command_that_was_silent_for_long_says_that_it_compiles(monkeypatch, c
     with compiling.compiling(argparse.Namespace(no_cache=True)):
         time.sleep(0.05)
     assert capsys.readouterr().err == ""
-    monkeypatch.setattr(compiling, "SILENT", 0.0)
+    monkeypatch.setattr(progress, "SILENT", 0.0)
     with compiling.compiling(argparse.Namespace(no_cache=True)):
         time.sleep(0.5)
     assert capsys.readouterr().err == "vsr-jax: compiling\n"
+
+
+def test_a_command_with_a_progress_bar_says_nothing_beside_it(monkeypatch, capsys):
+    monkeypatch.setattr(progress, "SILENT", 0.0)
+    with compiling.compiling(argparse.Namespace(no_cache=True, progress_bar=True)):
+        time.sleep(0.3)
+    assert capsys.readouterr().err == ""
+
+
+def reached(scene, target, **options):
+    return vsr.reach(scene, target, (0.0, 12.0), model=vsr.StrainDependent(4), **options)
+
+
+def test_reach_says_that_it_compiles_but_not_the_second_time(monkeypatch, capsys):
+    monkeypatch.setattr(progress, "SILENT", 0.0)
+    arm = vsr.Rod(0.3, vsr.Circular(0.01), vsr.Material(8e5, poisson=0.45))
+    scene = vsr.Scene(arm, [vsr.Tendon(vsr.Parallel(0.005, 0.0))])
+    target = vsr.solve(scene, [3.0]).tip[:3, 3]
+    reached(scene, target)
+    assert capsys.readouterr().err == "vsr_jax.reach: compiling\n"
+    found = reached(scene, target)
+    assert capsys.readouterr().err == ""
+    np.testing.assert_allclose(found.tip[:3, 3], target, atol=1e-4)
+    np.testing.assert_array_equal(found.tip, found.equilibrium.tip)
+    jax.clear_caches()
+    reached(scene, target, progress=False)
+    assert capsys.readouterr().err == ""

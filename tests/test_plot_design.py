@@ -1,14 +1,17 @@
 """Figures of designs, animations, annotations of arms; design files and the command that reads
 them."""
 
+import inspect
 import json
 import tomllib
 
 import jax.numpy as jnp
+import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import tomli_w
+from matplotlib.animation import FFMpegWriter
 
 import vsr_jax as vsr
 from vsr_jax.cli import design_commands as cli_design, main as cli
@@ -88,15 +91,50 @@ def arrows(ax):
 
 @pytest.mark.slow
 def test_frames_and_loads_are_drawn_onto_an_arm(eq):
-    ax = annotate.frames(eq, plot.arm(eq), stations=5)
+    ax = annotate.frames(eq, plot.arm(eq, details=False), stations=5)
     assert arrows(ax) == [15, 15, 15]  # one shaft and two lines of the head per arrow
     loaded = annotate.loads(eq)
     assert len(loaded.collections) == 2  # twelve arrows of the weight, one at the tip
     assert loaded.zz_dataLim.x0 < -0.26  # the limits include all arrow heads
     assert loaded.zz_dataLim.x1 > -0.001
-    (weight,), (tip,) = annotate._densities(eq, 0.3), annotate._point_forces(eq)
-    np.testing.assert_allclose(weight[1], [[0, 0, -9.81 * 1000 * np.pi * 1e-4]] * 12, rtol=1e-6)
-    np.testing.assert_allclose(tip[1][0], 0.02 * np.asarray(eq.tip)[:3, 2], rtol=1e-6)
+    weight, tip = annotate.rows_of(eq)
+    assert (weight.unit, tip.unit) == ("N/m", "N")
+    np.testing.assert_allclose(
+        weight.vectors, [[0, 0, -9.81 * 1000 * np.pi * 1e-4]] * 12, rtol=1e-6
+    )
+    np.testing.assert_allclose(tip.vectors[0], 0.02 * np.asarray(eq.tip)[:3, 2], rtol=1e-6)
+    texts = [text.get_text() for text in loaded.get_legend().get_texts()]
+    assert texts == ["gravity: force 3.08 N/m", "follower tip wrench: force 0.02 N"]
+    widths = [bundle.get_linewidth()[0] for bundle in loaded.collections]
+    assert widths[0] < widths[1]  # a weight per length does not look like a force at a point
+
+
+def test_the_equilibrium_comes_before_the_axes(unchecked, eq):
+    ax = plot.arm(eq)
+    for draw in (annotate.loads, annotate.frames, plot.arm):
+        names = list(inspect.signature(draw).parameters)
+        assert names[:2] == ["eq", "ax"]
+    with pytest.raises(ValueError, match=r"eq: got .*, need an Equilibrium, before the axes"):
+        annotate.loads(ax, eq)
+
+
+def test_moments_and_loads_that_depend_on_the_pose_are_drawn(eq):
+    loads = [
+        vsr.TipWrench(moment=(0.0, 0.0, 1e-3)),
+        vsr.Payload(0.01, X=0.3),
+        vsr.DistributedWrench(force=(0.0, 0.1, 0.0), frame="body"),
+    ]
+    rod = eq.scene.rod
+    arm = vsr.solve(vsr.Scene(rod, eq.scene.actuators, loads), [1.0], model=MODEL)
+    moment, payload, along = annotate.rows_of(arm)
+    np.testing.assert_allclose(moment.vectors, [[0.0, 0.0, 1e-3]])
+    np.testing.assert_allclose(payload.vectors, [[0.0, 0.0, -0.0981]], rtol=1e-6, atol=1e-12)
+    poses = np.asarray(arm.pose(jnp.linspace(0, 0.3, 12)))
+    np.testing.assert_allclose(along.vectors, 0.1 * poses[:, :3, 1], atol=1e-9)
+    assert [row.unit for row in (moment, payload, along)] == ["N m", "N", "N/m"]
+    ax = annotate.loads(arm)
+    styles = [line.get_linestyle() for line in ax.get_legend().get_lines()]
+    assert styles == ["--", "-", "-"]
 
 
 def test_arrows_of_point_forces_have_one_scale(eq):
@@ -123,10 +161,56 @@ def test_a_film_has_a_frame_for_each_arm(eq, tmp_path):
     moving = film([eq, eq, eq], tmp_path / "arm.gif", titles=["a", "b", "c"], seconds=1.0, dpi=30)
     assert moving is not None
     assert plt.imread(tmp_path / "arm.gif").ndim == 3
+    axes = moving._fig.axes[0]
+    assert [axes.get_xlabel(), axes.get_ylabel(), axes.get_zlabel()] == ["x [m]", "y [m]", "z [m]"]
+    with pytest.raises(ValueError, match=r"path: got 'arm\.avi', need a name that ends in \.gif"):
+        film([eq], "arm.avi")
     with pytest.raises(ValueError, match="equilibria: got none"):
         film([])
     with pytest.raises(ValueError, match="titles: got 1, need 2"):
         film([eq, eq], titles=["a"])
+
+
+def test_a_film_keeps_the_last_shape_where_a_solve_failed(eq, tmp_path):
+    bare = vsr.Scene(eq.scene.rod, eq.scene.actuators)
+    fine, failed = (vsr.solve(bare, [tension], model=MODEL) for tension in (1.0, 1e6))
+    moving = film([fine, failed], tmp_path / "arm.gif", titles=["one", "two"], dpi=30)
+    moving._func(1)
+    axes = moving._fig.axes[0]
+    assert moving._fig.get_suptitle() == "two: no equilibrium"
+    last = np.array(axes.lines[-1].get_data_3d()).T
+    np.testing.assert_allclose(last[-1], fine.tip[:3, 3], atol=1e-9)
+    with pytest.raises(ValueError, match=r"equilibria\[0\]: got a solve that failed"):
+        film([failed])
+
+
+def test_an_mp4_needs_ffmpeg(eq, tmp_path, monkeypatch):
+    monkeypatch.setitem(mpl.rcParams, "animation.ffmpeg_path", "no_such_program")
+    with pytest.raises(ValueError, match=r"need ffmpeg for \.mp4, or a \.gif"):
+        film([eq], tmp_path / "arm.mp4")
+
+
+@pytest.mark.skipif(not FFMpegWriter.isAvailable(), reason="needs ffmpeg")
+def test_a_film_as_mp4(eq, tmp_path):
+    film([eq, eq], tmp_path / "arm.mp4", seconds=1.0, dpi=33)
+    assert (tmp_path / "arm.mp4").read_bytes()[4:8] == b"ftyp"
+
+
+def test_a_design_is_drawn_for_every_set_of_inputs_with_its_targets(eq):
+    scene = vsr.Scene(eq.scene.rod, eq.scene.actuators)
+    none = History(np.zeros((0, 1)), np.zeros((0, 1)))
+    found = vsr.Design(scene, jnp.array([[1.0], [2.0]]), 0.0, True, {}, (), (), 0, none)
+    targets = np.array([[0.28, 0.03, 0.0], [0.26, 0.07, 0.0]])
+    objective = 0.5 * vsr.objective.TipError(targets) + vsr.objective.Tension(5.0)
+    for given in (targets, objective):
+        ax = plot_design.before_after(scene, found, [[0.5], [1.5]], model=MODEL, targets=given)
+        names = [text.get_text() for text in ax.get_legend().get_texts()]
+        assert names == ["before", "after", "target"]
+        ends = [np.array(line.get_data_3d())[:, -1] for line in ax.lines[1::2]]
+        tips = [vsr.solve(scene, [u], model=MODEL).tip[:3, 3] for u in (0.5, 1.5, 1.0, 2.0)]
+        np.testing.assert_allclose(ends, tips, atol=1e-9)
+        crosses = np.transpose(ax.collections[-1]._offsets3d)
+        np.testing.assert_allclose(crosses, targets)
 
 
 def test_the_command_designs_saves_and_draws(problem, tmp_path, capsys, monkeypatch):
@@ -137,8 +221,9 @@ def test_the_command_designs_saves_and_draws(problem, tmp_path, capsys, monkeypa
     code = cli.main(
         ["design", str(problem), "--out", str(out), "--json", str(record), "--plot", str(picture)]
     )
-    said = capsys.readouterr().out
+    said, bar = capsys.readouterr()
     assert code == 0
+    assert bar.index("compiling:   0%") < bar.index("designing: 100%")
     assert "Inside(wall=0.001): satisfied" in said
     assert "actuators[0].routing.y = " in said
     kept, told = load(out), json.loads(record.read_text())

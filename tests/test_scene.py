@@ -45,6 +45,13 @@ def test_bad_inputs_are_named(inputs, message):
         vsr.solve(SCENE, inputs)
 
 
+@pytest.mark.usefixtures("unchecked")
+def test_a_scene_without_actuators_takes_no_inputs():
+    message = r"inputs: got shape \(1,\), need \(0,\), an empty list: the scene has no actuators;"
+    with pytest.raises(ValueError, match=message):
+        vsr.solve(vsr.Scene(ARM), [1.0])
+
+
 def test_traced_inputs_get_a_status_instead():
     def status(inputs):
         return vsr.solve(SCENE, inputs).status
@@ -236,6 +243,15 @@ def test_discs_may_guide_threads_outside_the_section():
     np.testing.assert_allclose(
         eq.strain(0.2), [0, 0, 0.02 / EI, 1 - 2 / EA, 0, 0], rtol=1e-9, atol=1e-9
     )
+
+
+def test_no_guide_radius_is_advised_to_a_rod_that_has_one():
+    wire, steel = vsr.Circular(0.0007), vsr.Material(54e9, poisson=0.3)
+    thread = vsr.Tendon(vsr.Parallel(0.01, 0.0))
+    with pytest.raises(ValueError, match=r"the section \(or give the rod a guide_radius\)$"):
+        vsr.Scene(vsr.Rod(0.4, wire, steel), [thread])
+    with pytest.raises(ValueError, match=r"inside the guide_radius of 0\.008 m$"):
+        vsr.Scene(vsr.Rod(0.4, wire, steel, guide_radius=0.008), [thread])
 
 
 def test_base_and_rest_strain_place_the_arm_at_rest():

@@ -1,6 +1,7 @@
 """Numbers of a scene by name: what they are called, their units, and that a change reaches the
 scene."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -62,7 +63,6 @@ def test_names_are_those_of_the_constructors_and_units_follow(scene):
 
 def test_every_number_of_a_scene_has_a_name(scene):
     import equinox as eqx
-    import jax
 
     assert len(vsr.parameters(scene)) == len(
         jax.tree.leaves(eqx.filter(scene, eqx.is_inexact_array))
@@ -88,6 +88,59 @@ def test_patterns_and_names_that_nothing_has(scene):
         ValueError, match=r"no such number; did you mean 'actuators\[0\].routing.radius'"
     ):
         matching("actuators[0].routing.radus", known)
+
+
+def test_replace_changes_one_number_or_several(scene):
+    stiffer = scene.replace("rod.material.young", 6e5)
+    assert float(stiffer.rod.material.young.value) == 6e5
+    assert float(scene.rod.material.young.value) == 8e5
+    new = scene.replace({"loads[0].acceleration": (0, 0, 9.81), "actuators[*].routing.y": 0.001})
+    np.testing.assert_array_equal(new.loads[0].acceleration, (0, 0, 9.81))
+    np.testing.assert_array_equal(new.actuators[1].routing.y, [0.001] * 3)
+    np.testing.assert_array_equal(new.actuators[2].routing.y, [0.001] * 2)
+    assert jax.tree.structure(new) == jax.tree.structure(scene)
+    assert scene.replace({}) is scene
+
+
+def test_a_replaced_number_keeps_its_precision(scene):
+    small = scene.astype(jnp.float32).replace("rod.length", np.float64(0.31))
+    assert small.rod.length.dtype == jnp.float32
+
+
+def test_transforms_go_through_replace(helix):
+    def height(radius):
+        scene = helix.replace("actuators[0].routing.radius", radius)
+        return vsr.solve(scene, jnp.array([-15.0])).tip[2, 3]
+
+    radius = helix.actuators[0].routing.radius
+    slope = jax.grad(lambda scene: vsr.solve(scene, jnp.array([-15.0])).tip[2, 3])(helix)
+    np.testing.assert_allclose(
+        jax.jit(jax.grad(height))(radius), slope.actuators[0].routing.radius, rtol=1e-9
+    )
+    radii = jnp.array([0.004, 0.005])
+    np.testing.assert_allclose(jax.vmap(height)(radii), [height(x) for x in radii], rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("rod.material.yong", 6e5), "rod.material.yong: the scene has no such number; did you "),
+        (("rod.length", [0.3, 0.4]), r"rod.length: got shape \(2,\), need one number"),
+        (
+            ("loads[0].acceleration", [1.0, 2.0]),
+            r"loads\[0\].acceleration: got shape \(2,\), need one number or shape \(3,\)",
+        ),
+        (("rod.length", np.nan), "rod.length: got nan, need finite"),
+        (("rod.length", -0.1), "rod.length: got .*, need a finite number > 0"),
+        (("rod.material.young", -1.0), "Scene.rod.material.young: got -1 at X = 0 m"),
+        (("actuators[0].routing.radius", 0.02), r"Scene.actuators\[0\].routing: the thread is "),
+        (("rod.length",), "Scene.replace: got 'rod.length' and None, need a name and a value"),
+        (({"rod.length": 0.2}, 0.2), "Scene.replace: got .*, need a name and a value"),
+    ],
+)
+def test_errors_of_replace(unchecked, scene, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        scene.replace(*arguments)
 
 
 def test_a_class_of_your_own_declares_its_units():

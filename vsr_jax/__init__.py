@@ -4,85 +4,85 @@ chambers."""
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from .analysis import (
-    Branch,
-    Ellipsoid,
-    Health,
-    Reach,
-    Sensitivity,
-    Sweep,
-    check,
-    compliance,
-    compliance_ellipsoid,
-    follow,
-    follow_branch,
-    manipulability,
-    reach,
-    sensitivity,
-    sweep,
-    tip_jacobian,
-)
-from .arm import (
-    Annular,
-    Chamber,
-    Circular,
-    Constant,
-    DistributedWrench,
-    Elliptic,
-    Function,
-    FunctionProfile,
-    Gravity,
-    Helix,
-    Joined,
-    Linear,
-    MagneticDensity,
-    MagneticMoment,
-    Material,
-    Parallel,
-    Parameter,
-    Payload,
-    Piecewise,
-    PointWrench,
-    Polynomial,
-    PolynomialProfile,
-    Rectangular,
-    Rod,
-    Scene,
-    Spinning,
-    Spline,
-    SplineProfile,
-    Spring,
-    Taper,
-    Tendon,
-    Thread,
-    TipWrench,
-    parameters,
-)
-from .files import SceneFile, load, save
-from .models import (
-    Basis,
-    FunctionBasis,
-    Functions,
-    Legendre,
-    Monomial,
-    PiecewiseConstant,
-    Prescribed,
-    Status,
-    StrainDependent,
-    Trigonometric,
-    actuation_matrix,
-    jacobian,
-    stiffness_matrix,
-)
-from .numerics import se3, step_twist, zanna_step
-from .optimization import constraint, objective
-from .solution import Energy, Equilibrium, Error, Plan, SolveError, Summary, plan, solve
-
 if TYPE_CHECKING:
+    from .analysis import (
+        Branch,
+        Ellipsoid,
+        Health,
+        Reach,
+        Sensitivity,
+        Sweep,
+        check,
+        compliance,
+        compliance_ellipsoid,
+        follow,
+        follow_branch,
+        manipulability,
+        reach,
+        sensitivity,
+        sweep,
+        tip_jacobian,
+    )
+    from .arm import (
+        Annular,
+        Chamber,
+        Circular,
+        Constant,
+        DistributedWrench,
+        Elliptic,
+        Function,
+        FunctionProfile,
+        Gravity,
+        Helix,
+        Joined,
+        Linear,
+        MagneticDensity,
+        MagneticMoment,
+        Material,
+        Parallel,
+        Parameter,
+        Payload,
+        Piecewise,
+        PointWrench,
+        Polynomial,
+        PolynomialProfile,
+        Rectangular,
+        Rod,
+        Scene,
+        Spinning,
+        Spline,
+        SplineProfile,
+        Spring,
+        Taper,
+        Tendon,
+        Thread,
+        TipWrench,
+        parameters,
+        pose,
+    )
     from .fabrication import Fabrication, export
+    from .files import SceneFile, load, save
+    from .models import (
+        Basis,
+        FunctionBasis,
+        Functions,
+        Legendre,
+        Monomial,
+        PiecewiseConstant,
+        Prescribed,
+        Status,
+        StrainDependent,
+        Trigonometric,
+        actuation_matrix,
+        jacobian,
+        stiffness_matrix,
+    )
     from .models.continuum import Continuum
+    from .numerics import se3, step_twist, zanna_step
+    from .optimization import constraint, objective
     from .optimization.design_search import Design, design
     from .optimization.search import Search
+    from .solution import Energy, Equilibrium, Error, Plan, SolveError, Summary, plan, solve
     from .viz import annotate, plot, plot_design
     from .viz.animation import film
 
@@ -168,6 +168,7 @@ __all__ = [
     "plan",
     "plot",
     "plot_design",
+    "pose",
     "reach",
     "save",
     "se3",
@@ -179,6 +180,11 @@ __all__ = [
     "tip_jacobian",
     "zanna_step",
 ]
+
+_PACKAGES = ("analysis", "arm", "files", "models", "numerics", "optimization", "solution")
+"""Packages whose names the face shows, imported together when one of them is first used: importing
+JAX takes half a second, which the help of the command and shells that complete names do not need.
+"""
 
 _LATER = {
     "Continuum": "models.continuum",
@@ -197,10 +203,17 @@ import than all the rest."""
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _LATER:
+    if name in _LATER:
+        module = import_module(f".{_LATER[name]}", __name__)
+        return module if _LATER[name].endswith(f".{name}") else getattr(module, name)
+    if name in (*_PACKAGES, "mechanics", "typing", "validation"):
+        return import_module(f".{name}", __name__)
+    if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module = import_module(f".{_LATER[name]}", __name__)
-    return module if _LATER[name].endswith(f".{name}") else getattr(module, name)
+    for package in _PACKAGES:
+        module = import_module(f".{package}", __name__)
+        globals().update({x: getattr(module, x) for x in module.__all__ if x in __all__})
+    return globals()[name]
 
 
 def __dir__() -> list[str]:

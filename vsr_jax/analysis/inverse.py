@@ -28,8 +28,9 @@ from ..numerics.component import norm, split
 from ..numerics.se3 import rotation_vector
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
-from ..typing import Scalar, cast
+from ..typing import Pose, Scalar, cast
 from ..validation import instance, interval, is_traced, numbers, on_arm, positive, rigid
+from .progress import compiling, message_when_slow
 
 _SAMPLES, _STARTS = 512, 6
 """Random inputs, and the starts chosen among them."""
@@ -56,6 +57,11 @@ class Reach(NamedTuple):
     miss: Scalar
     reached: Bool[Array, ""]
     allowed_miss: Scalar
+
+    @property
+    def tip(self) -> Pose:
+        """Pose of the tip for these inputs, shape (4, 4)."""
+        return self.equilibrium.tip
 
     def __str__(self) -> str:
         numbers = (self.inputs, self.miss, self.reached, self.allowed_miss)
@@ -88,6 +94,7 @@ def reach(
     model: Model | None = None,
     allowed_miss: float | None = None,
     start: Reach | None = None,
+    progress: bool = True,
 ) -> Reach:
     """Inputs within bounds that bring the arm to a target, with the least effort among all that do.
 
@@ -108,6 +115,8 @@ def reach(
       little as they can, in place of the least effort; no other start is tried, and each solve
       begins with the equilibrium of the start and stays in its branch. No derivative is taken with
       respect to it.
+    - `progress`: whether to say on stderr that the program compiles, if that takes more than three
+      seconds.
 
     **Returns:** a `Reach`.
 
@@ -129,7 +138,9 @@ def reach(
     )
     if start is not None:
         start = lax.stop_gradient(cast(_check_start(start, low), aim.dtype))
-    return _reach(_ReachProblem(scene, aim, stations, low, high, model, start), allowed)
+    problem = _ReachProblem(scene, aim, stations, low, high, model, start)
+    with message_when_slow("vsr_jax.reach: compiling", start=False, shown=progress):
+        return _reach(problem, allowed)
 
 
 class _ReachProblem(NamedTuple):
@@ -219,6 +230,7 @@ def _check_start(start: Reach, low: Array) -> Reach:
 
 @eqx.filter_jit
 def _reach(problem: _ReachProblem, allowed: Scalar) -> Reach:
+    compiling()
     still = _still(problem)
     enough = jnp.minimum(allowed / still.scene.rod.length, _CLOSE_ENOUGH[still.target.dtype.name])
     starts = _starts(problem) if problem.start is None else still.idle[None]

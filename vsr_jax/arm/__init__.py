@@ -7,6 +7,7 @@ Data and their geometry only. Must not know how an equilibrium is found or how a
 from .actuator import Actuator, Chamber, Tendon, Thread
 from .loads import DistributedWrench, Frame, Gravity, Load, PointWrench, TipWrench
 from .material import Material
+from .placement import pose
 from .pose_loads import (
     MagneticDensity,
     MagneticMoment,
@@ -74,4 +75,5 @@ __all__ = [
     "Thread",
     "TipWrench",
     "parameters",
+    "pose",
 ]

@@ -1,7 +1,7 @@
 """A scene: a rod with its actuators and loads, and the quantities that models need at each
 cross-section."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..numerics.component import Forces, Vector, Wrench, add, dot
 from ..numerics.quadrature import make_grid, piece_edges
-from ..typing import DTypeLike, Scalar, VectorLike, cast
+from ..typing import ArrayLike, DTypeLike, Scalar, VectorLike, cast
 from ..validation import ROUNDING, concrete, instance, is_traced, numbers, precise
 from .actuator import Actuator
 from .description import Part, describe, described_arguments, table
@@ -21,6 +21,7 @@ from .pose_loads import PoseLoad
 from .profile import Limits
 from .rod import STRAINS, Rod
 from .routing import Path, thread_tangent
+from .scene_numbers import checked_values, replaced
 
 
 class CrossSections(NamedTuple):
@@ -220,11 +221,15 @@ class Scene(Part):
         NaN, infinities and values outside an actuator's range.
         """
         array = numbers("inputs", inputs, None, finite=False)
-        kinds = ", ".join(type(a).__name__ for a in self.actuators)
         if array.shape != (len(self.actuators),):
+            kinds = ", ".join(type(actuator).__name__ for actuator in self.actuators)
+            needed = (
+                f"({len(self.actuators)},), one number each for {kinds}"
+                if kinds
+                else "(0,), an empty list: the scene has no actuators"
+            )
             raise ValueError(
-                f"inputs: got shape {array.shape}, need ({len(self.actuators)},), one number each "
-                f"for {kinds}; for a batch use jax.vmap"
+                f"inputs: got shape {array.shape}, need {needed}; for a batch use jax.vmap"
             )
         known = concrete(array)
         if known is None:
@@ -253,6 +258,38 @@ class Scene(Part):
         """Length of a thread's path at rest [m]."""
         return _rest_length(self, place)
 
+    def replace(
+        self,
+        name: str | Mapping[str, ArrayLike | VectorLike],
+        value: ArrayLike | VectorLike | None = None,
+    ) -> "Scene":
+        """The scene with other numbers: `scene.replace("rod.material.young", 6e5)`, or several by
+        `scene.replace({"rod.length": 0.3, "actuators[*].routing.radius": 0.004})`.
+
+        `jax.jit`, `jax.vmap` and `jax.grad` go through the new values.
+
+        **Arguments:**
+        - `name`: a name of `vsr_jax.parameters`, where `[*]` stands for every index; or a mapping
+          from names to values.
+        - `value`: of the shape of the number, or one number for all of an array. It takes the
+          precision of the number that it replaces.
+
+        **Raises:** `ValueError` for an unknown name (with the nearest one), a wrong shape, and
+        known numbers that no scene may have, as above.
+        """
+        if isinstance(name, Mapping) and value is None:
+            values = name
+        elif isinstance(name, str) and value is not None:
+            values = {name: value}
+        else:
+            raise ValueError(
+                f"Scene.replace: got {name!r} and {value!r}, need a name and a value, or a mapping "
+                f"from names to values"
+            )
+        scene = replaced(self, checked_values(self, values))
+        scene._check_numbers()
+        return scene
+
     def astype(self, dtype: DTypeLike) -> "Scene":
         """The same scene with its floating-point numbers in `dtype`, float32 or float64."""
         precise("dtype", jnp.zeros((), dtype))
@@ -261,7 +298,7 @@ class Scene(Part):
     def _check_numbers(self) -> None:
         if any(is_traced(leaf) for leaf in jax.tree.leaves((self.rod, self.actuators, self.loads))):
             return
-        length = float(self.rod.length)
+        length = float(numbers("Scene.rod.length", self.rod.length, positive=True))
         self._check_places(length)
         probe = jax.tree.map(concrete, _probe(self))
         if probe[0] is None:
@@ -277,10 +314,15 @@ class Scene(Part):
         for i, values in enumerate(clearances):
             j = int(np.argmin(values))
             if not values[j] > -ROUNDING * length:
+                guide = self.rod.guide_radius
+                outside, needed = (
+                    ("section", "the section (or give the rod a guide_radius)")
+                    if guide is None
+                    else ("section and the guides", f"the guide_radius of {float(guide):g} m")
+                )
                 raise ValueError(
-                    f"Scene.actuators[{i}].routing: the thread is {-values[j]:.3g} m outside "
-                    f"the section at X = {X[j]:g} m; "
-                    "need a path inside the section (or give the rod a guide_radius)"
+                    f"Scene.actuators[{i}].routing: the thread is {-values[j]:.3g} m outside the "
+                    f"{outside} at X = {X[j]:g} m; need a path inside {needed}"
                 )
 
     def _check_places(self, length: float) -> None:

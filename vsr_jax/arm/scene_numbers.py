@@ -11,14 +11,19 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from functools import reduce
 from operator import attrgetter, itemgetter
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ..typing import ArrayLike, VectorLike
+from ..validation import numbers
+from .description import Part
 from .fields import Unit, coefficient_unit, item_unit, unit_of
-from .scene import Scene
+
+AnyPart = TypeVar("AnyPart", bound=Part)
 
 Way = tuple[Callable[[Any], Any], ...]
 
@@ -46,7 +51,7 @@ class Parameter(NamedTuple):
         ]
 
 
-def parameters(scene: Scene) -> dict[str, Parameter]:
+def parameters(scene: Part) -> dict[str, Parameter]:
     """Every number of a scene by its name: its `value`, and its `unit` if known."""
     return dict(_walk(scene, "", "", False, ()))
 
@@ -65,7 +70,25 @@ def matching(pattern: str, known: Mapping[str, object]) -> list[str]:
     return names
 
 
-def replaced(scene: Scene, values: Mapping[str, Array]) -> Scene:
+def checked_values(scene: Part, values: Mapping[str, ArrayLike | VectorLike]) -> dict[str, Array]:
+    """New values of named numbers of a scene by their full names, in the precision and the shape of
+    the numbers that they replace; one number stands for all of an array.
+
+    **Raises:** `ValueError` for a name that the scene does not have, a wrong shape, and known
+    values that are not finite.
+    """
+    known, found = parameters(scene), {}
+    for pattern, value in values.items():
+        for name in matching(pattern, known):
+            old, new = known[name].value, numbers(name, value, None)
+            if new.shape not in ((), old.shape):
+                shapes = f"one number or shape {old.shape}" if old.shape else "one number"
+                raise ValueError(f"{name}: got shape {new.shape}, need {shapes}")
+            found[name] = jnp.broadcast_to(new, old.shape).astype(old.dtype)
+    return found
+
+
+def replaced(scene: AnyPart, values: Mapping[str, Array]) -> AnyPart:
     """The scene with new values of the named numbers."""
     known = parameters(scene)
     ways = [known[name].way for name in values]

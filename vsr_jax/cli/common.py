@@ -1,5 +1,5 @@
 """Shared by the commands of `vsr-jax`: exit codes, help format, common arguments, settings of the
-compiler."""
+compiler. Does not import JAX, which the help does not need."""
 
 import argparse
 import os
@@ -7,7 +7,6 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
-import jax
 import numpy as np
 
 DONE, NOT_CONVERGED, BAD_USAGE = 0, 1, 2
@@ -26,7 +25,6 @@ def command(
     *,
     example: str,
     run: Callable,
-    help: str,
     description: str,
     more: str = "",
 ) -> argparse.ArgumentParser:
@@ -34,7 +32,6 @@ def command(
     epilog = f"example:\n  {example}\n{more}\n{EXIT_CODES}"
     parser = commands.add_parser(
         name,
-        help=help,
         description=description,
         epilog=epilog,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -98,6 +95,8 @@ def add_precision(parser: argparse.ArgumentParser) -> None:
 
 def set_precision(precision: str) -> None:
     """Enables double precision in JAX if needed; call it before any array is created."""
+    import jax
+
     if precision == "float64":
         jax.config.update("jax_enable_x64", True)
 
@@ -143,6 +142,8 @@ def reduce_compile_time(*, optimise: bool) -> None:
     `optimise` it also skips its own optimisation passes. XLA aborts on unknown flags, so they are
     set only for releases that know them.
     """
+    import jax
+
     if jax.__version_info__ < (0, 11):
         flags = (
             "--xla_cpu_use_fusion_emitters=false",

@@ -7,12 +7,13 @@ that a wrong one is never used.
 import argparse
 import os
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import jax
+
+from ..analysis.progress import message_when_slow
 
 VARIABLE = "VSR_JAX_CACHE"
 """Environment variable with another folder, or "off"."""
@@ -20,9 +21,6 @@ VARIABLE = "VSR_JAX_CACHE"
 MOST_BYTES = 500_000_000
 """Size of the cache above which the programs that were used longest ago are removed; a program
 takes 0.1 to 2 MB."""
-
-SILENT = 3.0
-"""Seconds after which the command says that it compiles."""
 
 
 def cache_folder() -> Path | None:
@@ -90,17 +88,13 @@ def remove_oldest(folder: Path, most_bytes: int) -> None:
 def compiling(options: argparse.Namespace) -> Iterator[None]:
     """Runs a command with the cache; says so on stderr if it has been silent for three seconds.
 
-    A command without `--no-cache`, whose purpose is to measure compile times, runs as it is.
+    A command without `--no-cache`, whose purpose is to measure compile times, runs as it is; one
+    with a progress bar says so there.
     """
     if not hasattr(options, "no_cache"):
         yield
         return
     later = "; the same kind of scene is faster from now on" if keep_programs(options) else ""
-    text = f"vsr-jax: compiling{later}"
-    timer = threading.Timer(SILENT, print, [text], {"file": sys.stderr, "flush": True})
-    timer.daemon = True
-    timer.start()
-    try:
+    silent = not getattr(options, "progress_bar", False)
+    with message_when_slow(f"vsr-jax: compiling{later}", shown=silent):
         yield
-    finally:
-        timer.cancel()

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from ..analysis.plausible import warnings_of
-from ..arm.scene import Scene
 from ..files.output import write_json
 from ..files.scene_file import save
 from .common import (
@@ -30,7 +29,6 @@ def add_design(commands: Commands) -> None:
     parser = command(
         commands,
         "design",
-        help="find routings, sizes and inputs by gradient descent",
         description="Finds numbers of a scene that minimise objectives under constraints, as "
         "specified by a problem file.",
         example="vsr-jax design problem.toml --out designed.toml --plot design.png",
@@ -65,6 +63,7 @@ def add_design(commands: Commands) -> None:
     )
     add_precision(parser)
     add_cache(parser)
+    parser.set_defaults(progress_bar=True)
 
 
 def _design(options: argparse.Namespace) -> int:
@@ -109,19 +108,20 @@ def _design(options: argparse.Namespace) -> int:
             },
         )
     if options.plot:
-        _draw(problem.scene, found, inputs[0], options.plot)
+        _draw(problem, found, inputs, options.plot)
     return DONE if found.feasible else NOT_CONVERGED
 
 
-def _draw(scene: Scene, found: Any, inputs: np.ndarray, path: str) -> None:
+def _draw(problem: Any, found: Any, inputs: np.ndarray, path: str) -> None:
     draw_without_display()
     import matplotlib.pyplot as plt
 
-    from ..viz import plot_design
+    from ..viz import plot, plot_design
 
-    figure = plt.figure(figsize=(10, 4.5))
-    space = figure.add_subplot(projection="3d")
-    space.set_position((0.0, 0.05, 0.52, 0.9))
-    plot_design.before_after(scene, found, inputs, space)
-    plot_design.history(found, figure.add_axes((0.66, 0.14, 0.32, 0.8)))
-    figure.savefig(path, dpi=150)
+    with plot.theme():
+        figure = plt.figure(figsize=(10, 4.5))
+        space = figure.add_subplot(projection="3d")
+        space.set_position((0.0, 0.02, 0.52, 0.92))
+        plot_design.before_after(problem.scene, found, inputs, space, targets=problem.objective)
+        plot_design.history(found, figure.add_axes((0.66, 0.14, 0.32, 0.8)))
+        figure.savefig(path, dpi=150)

@@ -33,7 +33,6 @@ def add_export(commands: Commands) -> None:
     parser = command(
         commands,
         "export",
-        help="write files for the workshop: body, thread curves, drilling plan, lengths",
         description="Writes the arm of a scene file for the workshop, in millimetres and degrees: "
         "at rest, or bent by --inputs.\n"
         "Prints the drilling plan, the lengths of cables and tubes and the thinnest wall; warns of "

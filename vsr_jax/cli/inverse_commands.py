@@ -28,7 +28,6 @@ def add_reach(commands: Commands) -> None:
     parser = command(
         commands,
         "reach",
-        help="find the inputs of a scene file that bring its tip to a position",
         description="Finds inputs between two bounds that bring the tip to a position with the "
         "least effort, and solves the scene there.\n"
         "Exit code 1: the position is out of reach; the nearest point found is printed.",
@@ -70,6 +69,7 @@ def _reach(options: argparse.Namespace) -> int:
         (low, high),
         model=model,
         allowed_miss=options.allowed_miss,
+        progress=False,
     )
     eq = found.equilibrium
     print("\n".join(report.lines(eq, report.values(eq), task.title or options.scene)))

@@ -4,29 +4,70 @@ reproduces the paper, measures costs."""
 import argparse
 import sys
 from collections.abc import Sequence
+from importlib import import_module
+from typing import NamedTuple
 
 from .. import __version__
 from .common import BAD_USAGE, EXIT_CODES
-from .compiling import compiling
-from .design_commands import add_design
-from .fabrication_commands import add_export
-from .inverse_commands import add_reach
-from .scene_commands import add_check, add_solve
-from .study_commands import add_accuracy, add_effects, add_paper
-from .sweep_commands import add_sweep
 
-EXAMPLES = (
-    "vsr-jax solve scene.toml --plot arm.png",
-    "vsr-jax check scene.toml",
-    "vsr-jax sweep scene.toml --samples 100000 --plot workspace.png",
-    "vsr-jax reach scene.toml --target 0.5 0.1 0.2 --high 12",
-    "vsr-jax design problem.toml --out designed.toml",
-    "vsr-jax export scene.toml --stl arm.stl --step arm.step --csv threads.csv",
-    "vsr-jax paper --out results",
-    "vsr-jax effects",
-    "vsr-jax accuracy scene.toml",
-)
-"""One example per command."""
+
+class Command(NamedTuple):
+    """A command: the module with its function `add_<name>`, what the list of commands says of it,
+    and an example."""
+
+    module: str
+    help: str
+    example: str
+
+
+COMMANDS = {
+    "solve": Command(
+        "scene_commands",
+        "solve a scene file and print, draw or save the result",
+        "vsr-jax solve scene.toml --plot arm.png",
+    ),
+    "check": Command(
+        "scene_commands",
+        "report the health of the solve of a scene file",
+        "vsr-jax check scene.toml",
+    ),
+    "sweep": Command(
+        "sweep_commands",
+        "solve a scene file for many inputs: its workspace",
+        "vsr-jax sweep scene.toml --samples 100000 --plot workspace.png",
+    ),
+    "reach": Command(
+        "inverse_commands",
+        "find the inputs of a scene file that bring its tip to a position",
+        "vsr-jax reach scene.toml --target 0.5 0.1 0.2 --high 12",
+    ),
+    "design": Command(
+        "design_commands",
+        "find routings, sizes and inputs by gradient descent",
+        "vsr-jax design problem.toml --out designed.toml",
+    ),
+    "export": Command(
+        "fabrication_commands",
+        "write files for the workshop: body, thread curves, drilling plan, lengths",
+        "vsr-jax export scene.toml --stl arm.stl --step arm.step --csv threads.csv",
+    ),
+    "paper": Command(
+        "study_commands",
+        "reproduce section IV of the paper: table and figures",
+        "vsr-jax paper --out results",
+    ),
+    "effects": Command(
+        "study_commands",
+        "measure what each effect of a scene costs on this machine",
+        "vsr-jax effects",
+    ),
+    "accuracy": Command(
+        "study_commands",
+        "measure accuracy against time for every model",
+        "vsr-jax accuracy scene.toml",
+    ),
+}
+"""The commands by name, in the order of the help."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -37,9 +78,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     **Raises:** `SystemExit` from argparse, with 0 after help or version, 2 for invalid
     arguments.
     """
-    options = _parser().parse_args(
-        [_spaced(argument) for argument in (sys.argv[1:] if argv is None else argv)]
-    )
+    arguments = [_spaced(argument) for argument in (sys.argv[1:] if argv is None else argv)]
+    options = _parser(arguments[:1]).parse_args(arguments)
+    from .compiling import compiling
+
     try:
         with compiling(options):
             return options.run(options)
@@ -56,23 +98,22 @@ def _spaced(argument: str) -> str:
         return argument
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser(chosen: Sequence[str]) -> argparse.ArgumentParser:
+    """The parser, with the arguments of the chosen command only: their modules import JAX."""
+    examples = (command.example for command in COMMANDS.values())
     parser = argparse.ArgumentParser(
         prog="vsr-jax",
         description="Statics of soft manipulators: Cosserat rods bent by tendons and fluidic "
         "chambers.",
-        epilog="\n  ".join(("examples:", *EXAMPLES)) + f"\n\n{EXIT_CODES}",
+        epilog="\n  ".join(("examples:", *examples)) + f"\n\n{EXIT_CODES}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"vsr-jax {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    add_solve(commands)
-    add_check(commands)
-    add_sweep(commands)
-    add_reach(commands)
-    add_design(commands)
-    add_export(commands)
-    add_paper(commands)
-    add_effects(commands)
-    add_accuracy(commands)
+    for name, command in COMMANDS.items():
+        if name in chosen:
+            module = import_module(f".{command.module}", __package__)
+            getattr(module, f"add_{name}")(commands)
+        else:
+            commands.add_parser(name, help=command.help)
     return parser

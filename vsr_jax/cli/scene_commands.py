@@ -66,7 +66,6 @@ def add_solve(commands: Any) -> None:
     parser = command(
         commands,
         "solve",
-        help="solve a scene file and print, draw or save the result",
         description="Solves the scene of a TOML file and prints status, tip, stability and "
         "threads.",
         example="vsr-jax solve scene.toml --inputs 8 2.5 --plot arm.png --json arm.json",
@@ -89,7 +88,6 @@ def add_check(commands: Any) -> None:
     parser = command(
         commands,
         "check",
-        help="report the health of the solve of a scene file",
         description="Solves the scene of a TOML file and 65 variants of it, 129 for a scene with "
         "inputs and loads. Prints the\n"
         "status, the stability margin, how far inputs and loads may grow and how the solve fails "
@@ -216,7 +214,7 @@ def _check(options: argparse.Namespace) -> int:
 def _tell(eq: Equilibrium, title: str, options: argparse.Namespace) -> None:
     from . import report
 
-    found = report.summary(eq, STATIONS) if options.plot or options.json else None
+    found = report.summary(eq, STATIONS) if options.json else None
     values = report.values(eq) if found is None else found.values
     error = options.tolerance is not None
     print("\n".join(report.lines(eq, values, title or options.scene, error=error)))
@@ -224,16 +222,21 @@ def _tell(eq: Equilibrium, title: str, options: argparse.Namespace) -> None:
         write_json(
             options.json, {"scene": options.scene, "title": title, **report.record(eq, found)}
         )
-    if options.plot and found is not None:
-        draw_without_display()
-        import matplotlib.pyplot as plt
+    if options.plot:
+        _draw(eq, title, options.plot)
+        if not bool(eq.converged):
+            said = "the solve failed, so it shows the arm at rest"
+            print(f"vsr-jax: {options.plot}: {said}", file=sys.stderr)
 
-        from ..viz import plot
 
-        plot.arm(found).set_title(title)
-        plt.savefig(options.plot, dpi=200, bbox_inches="tight")
-    elif options.plot:
-        print(f"vsr-jax: {options.plot} is not drawn: the solve failed", file=sys.stderr)
+def _draw(eq: Equilibrium, title: str, path: str) -> None:
+    draw_without_display()
+    from ..viz import plot
+
+    with plot.theme():
+        figure: Any = plot.arm(eq, stations=STATIONS).figure
+        figure.text(0.015, 0.02, title)
+        figure.savefig(path, dpi=200)
 
 
 def _model(name: str | None, steps: int | None, scene: Scene) -> Model | None:

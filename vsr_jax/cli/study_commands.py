@@ -30,7 +30,6 @@ def add_paper(commands: Commands) -> None:
     parser = command(
         commands,
         "paper",
-        help="reproduce section IV of the paper: table and figures",
         description="Solves the cases of section IV of Renda et al. (2020) with every model, "
         "compares them with the reference\n"
         "solutions and writes table.md, table.json, Fig. 2 and, with case A2, Fig. 3 (PNG and "
@@ -55,7 +54,6 @@ def add_effects(commands: Commands) -> None:
     parser = command(
         commands,
         "effects",
-        help="measure what each effect of a scene costs on this machine",
         description="Adds effects to one arm, one at a time: poses, gravity, a tip wrench, a "
         "follower load, a second section,\n"
         "a tendon driven by its length, friction. Prints the operations of the compiled program "
@@ -85,7 +83,6 @@ def add_accuracy(commands: Commands) -> None:
     parser = command(
         commands,
         "accuracy",
-        help="measure accuracy against time for every model",
         description="Solves a scene, by default the paper's B2, with every model at several "
         "resolutions, for random inputs between\n"
         "10 % and 100 % of the given inputs. Prints errors of tip, strain and gradient with their "

@@ -30,7 +30,6 @@ def add_sweep(commands: Any) -> None:
     parser = command(
         commands,
         "sweep",
-        help="solve a scene file for many inputs: its workspace",
         description="Draws inputs uniformly between two bounds, solves the scene of a TOML file "
         "for each, and prints the extent\n"
         "of the tip positions. The same command resumes an interrupted sweep to disk. The exit "
@@ -93,9 +92,13 @@ def _sweep(options: argparse.Namespace) -> int:
     tips = np.asarray(result["tip"])[:, :3, 3]
     print("\n".join(_lines(task.title or options.scene, low, high, result, tips)))
     print(f"time        {seconds:.1f} s, including compilation")
+    if not np.any(result.converged):
+        if options.plot:
+            print(f"vsr-jax: {options.plot} is not drawn: no sample converged", file=sys.stderr)
+        return NOT_CONVERGED
     if options.plot:
         _draw(options.plot, task.title, tips, inputs, low, high)
-    return DONE if np.any(result.converged) else NOT_CONVERGED
+    return DONE
 
 
 def _lines(
@@ -123,6 +126,7 @@ def _draw(
         if 0 < np.sum(varied) < 4
         else None
     )
-    axes = plot.workspace(tips, values=share, label="mean share of the inputs' range")
-    axes[0].figure.suptitle(title)
-    axes[0].figure.savefig(Path(path), dpi=200)
+    with plot.theme():
+        axes = plot.workspace(tips, values=share, label="mean share of the inputs' range")
+        axes[0].figure.suptitle(title)
+        axes[0].figure.savefig(Path(path), dpi=200)

@@ -163,7 +163,7 @@ def design(
     - `model`: as for `solve`.
     - `search`: number of starts and steps, optimizer, when to stop; `Search()` by default.
     - `out`: checkpoint file; the same call resumes from it.
-    - `progress`: whether to show a progress bar.
+    - `progress`: whether to show a progress bar, which says "compiling" until the first step.
 
     **Returns:** a `Design`.
 
@@ -177,8 +177,9 @@ def design(
     instance("search", search, Search, "a Search")
     rule, settings = search.update_rule, (search.starts, search.candidates, search.seed)
     checkpoint = Checkpoint(out, problem, rule, (*settings, search.steps))
-    states = begin(problem, rule, given, *settings)
-    states, history = _run(problem, rule, search, checkpoint, states, progress)
+    with tqdm(total=search.steps, unit=" steps", disable=not progress, desc="compiling") as bar:
+        states = begin(problem, rule, given, *settings)
+        states, history = _run(problem, rule, search, checkpoint, states, bar)
     return _result(problem, terms, states, history)
 
 
@@ -188,32 +189,30 @@ def _run(
     search: Search,
     checkpoint: Checkpoint,
     states: DescentState,
-    progress: bool,
+    bar: tqdm,
 ) -> tuple[DescentState, History]:
     states, history = checkpoint.read(states)
-    total = search.steps
-    with tqdm(
-        total=total, initial=len(history.objective), unit=" steps", disable=not progress
-    ) as bar:
-        while not search.finished(history):
-            first, rows = len(history.objective), []
-            for done in range(first, min(first + _CHUNK, total)):
-                states, row = descend(problem, rule, states, penalty_weight(done, total))
-                rows.append(row)
-            history = History(
-                *(
-                    np.concatenate([old, np.stack(new)])
-                    for old, new in zip(history, zip(*rows, strict=True), strict=True)
-                )
+    bar.initial = bar.n = len(history.objective)
+    while not search.finished(history):
+        first, rows = len(history.objective), []
+        for done in range(first, min(first + _CHUNK, search.steps)):
+            states, row = descend(problem, rule, states, penalty_weight(done, search.steps))
+            bar.set_description("designing", refresh=done == first)  # compiled by the first step
+            rows.append(row)
+        history = History(
+            *(
+                np.concatenate([old, np.stack(new)])
+                for old, new in zip(history, zip(*rows, strict=True), strict=True)
             )
-            checkpoint.write(states, history)
-            best = best_start(states.best)
-            feasible = int(np.sum(np.asarray(states.best.violation) <= 0))
-            bar.set_postfix_str(
-                f"objective {float(states.best.objective[best]):.3g}, {feasible} feasible",
-                refresh=False,
-            )
-            bar.update(len(rows))
+        )
+        checkpoint.write(states, history)
+        best = best_start(states.best)
+        feasible = int(np.sum(np.asarray(states.best.violation) <= 0))
+        bar.set_postfix_str(
+            f"objective {float(states.best.objective[best]):.3g}, {feasible} feasible",
+            refresh=False,
+        )
+        bar.update(len(rows))
     return states, history
 
 

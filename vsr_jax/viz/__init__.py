@@ -1,4 +1,4 @@
-"""Pictures: arms, strains, workspaces, films, designs, with matplotlib.
+"""Pictures: arms, strains, workspaces, films, designs, with matplotlib, in one style.
 
 The public face imports these modules when they are first used.
 """

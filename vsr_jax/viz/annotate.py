@@ -1,22 +1,28 @@
 """Annotations of an arm in 3D, drawn after `plot.arm`: frames of sections, arrows of loads,
 ellipsoids of the tip."""
 
+from typing import Any, NamedTuple
+
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Array
 from matplotlib.typing import ColorType
 from mpl_toolkits.mplot3d import Axes3D
 
 from ..analysis.derivatives import Ellipsoid
-from ..arm.loads import Frame
+from ..arm.loads import Load
 from ..arm.pose_loads import PoseLoad
+from ..arm.rod import Rod
 from ..solution.equilibrium import Equilibrium
-from .plot import COLORS, equal_scale
+from ..validation import instance
+from .space import FRAME_COLORS, checked_space, equal_scale
+from .style import COLORS
 
 _SHARE = 0.08
 """Length of the axes of a frame relative to the arm; load arrows are twice as long."""
+_STATIONS = 12
+"""Arrows of a load along the arm."""
 
 
 def frames(
@@ -29,9 +35,9 @@ def frames(
 
     **Returns:** the axes.
     """
-    ax, length = _axes(ax), float(eq.scene.rod.length)
+    ax, length = checked_space(ax), float(eq.scene.rod.length)
     poses = np.asarray(eq.pose(jnp.linspace(0, length, stations)))
-    for i, (name, color) in enumerate(zip("xyz", (COLORS[1], COLORS[2], COLORS[0]), strict=True)):
+    for i, (name, color) in enumerate(zip("xyz", FRAME_COLORS, strict=True)):
         arrows = _SHARE * length if size is None else size
         ax.quiver(
             *poses[:, :3, 3].T,
@@ -45,78 +51,108 @@ def frames(
     return ax
 
 
-def loads(eq: Equilibrium, ax: Axes3D | None = None, *, color: ColorType = COLORS[1]) -> Axes3D:
-    """Forces of the loads as arrows, at points and along the arm.
+def loads(
+    eq: Equilibrium,
+    ax: Axes3D | None = None,
+    *,
+    color: ColorType | None = None,
+    legend: bool = True,
+) -> Axes3D:
+    """Forces and moments of the loads as arrows: at points, and in rows along the arm.
 
-    Point forces [N] have one scale and densities [N/m] another: the longest arrow of each is 16 %
-    of the arm. Moments are not drawn.
+    Point forces [N], forces per length [N/m] and moments (dashed) each have a scale of their own:
+    the longest arrow of each is 16 % of the arm.
 
-    **Arguments:** `ax`: 3D axes, new ones by default; `color`: of the arrows.
+    **Arguments:** `ax`: 3D axes, new ones by default; `color`: of all arrows, by default one for
+    points and one for rows; `legend`: whether to name the loads, with their greatest values.
 
     **Returns:** the axes.
+
+    **Raises:** `ValueError` for an equilibrium that did not converge.
     """
-    ax, length = _axes(ax), float(eq.scene.rod.length)
-    for groups in (_point_forces(eq), _densities(eq, length)):
-        longest = max((_longest(force) for _, force in groups), default=0.0)
-        for here, force in groups:
-            if _longest(force) == 0:
-                continue
-            arrows = 2 * _SHARE * length / longest * force
-            ax.quiver(*here.T, *arrows.T, color=color, linewidth=1.2, arrow_length_ratio=0.25)
-            # without had_data the limits would contain only these ends
-            ax.auto_scale_xyz(*(here + arrows).T, had_data=True)
+    instance("eq", eq, Equilibrium, "an Equilibrium, before the axes")
+    if not bool(eq.converged):
+        raise ValueError(f"eq: got a solve that failed ({eq.message}), need a converged one")
+    ax, length = checked_space(ax), float(eq.scene.rod.length)
+    rows = rows_of(eq)
+    longest = {row.unit: max(r.greatest for r in rows if r.unit == row.unit) for row in rows}
+    for row in rows:
+        arrows = 2 * _SHARE * length / longest[row.unit] * row.vectors
+        _draw_arrows(ax, row, arrows, color)
+        # without had_data the limits would contain only these ends
+        ax.auto_scale_xyz(*(row.places + arrows).T, had_data=True)
     equal_scale(ax)
+    if legend and rows:
+        ax.legend(loc="upper left")
     return ax
 
 
-def _longest(force: np.ndarray) -> float:
-    return float(np.max(np.linalg.norm(force, axis=-1), initial=0.0))
+class Row(NamedTuple):
+    """Forces or moments of one load in the world's axes: `places` [m] and `vectors`, shape (n, 3),
+    and their unit."""
+
+    name: str
+    unit: str
+    places: np.ndarray
+    vectors: np.ndarray
+
+    @property
+    def moment(self) -> bool:
+        """Whether these are moments."""
+        return self.unit.startswith("N m")
+
+    @property
+    def greatest(self) -> float:
+        """The greatest magnitude, 0 without numbers."""
+        return float(np.max(np.linalg.norm(self.vectors, axis=-1), initial=0.0))
 
 
-_FRAMES: tuple[Frame, ...] = ("world", "body")
+def rows_of(eq: Equilibrium) -> list[Row]:
+    """Forces and moments of the loads of an equilibrium, without those that are zero."""
+    rod, loads = eq.scene.rod, eq.scene.loads
+    if not loads:
+        return []
+    along = jnp.linspace(0, rod.length, _STATIONS)
+    X = [along if (x := load.place(rod)) is None else x[None] for load in loads]
+    ends = np.cumsum([x.size for x in X])[:-1]
+    poses = np.split(np.asarray(eq.pose(jnp.concatenate(X))), ends)
+    rows = []
+    for load, x, pose in zip(loads, X, poses, strict=True):
+        per_length = "" if load.place(rod) is not None else "/m"
+        wrench = _wrench(load, rod, x, pose)
+        for unit, vectors in (("N", wrench[:, 3:]), ("N m", wrench[:, :3])):
+            row = Row(load.effects[0], unit + per_length, pose[:, :3, 3], vectors)
+            rows += [row] if row.greatest > 0 else []
+    return rows
 
 
-def _point_forces(eq: Equilibrium) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Positions [m] and forces [N] in the world's axes of the dead and the follower loads at
-    points."""
-    found = []
-    for frame in _FRAMES:
-        points = eq.scene.point_wrenches(frame)
-        if points:
-            force = jnp.stack([jnp.stack(wrench[3:]) for _, wrench in points])
-            found.append(_placed(eq, jnp.stack([x for x, _ in points]), force, frame))
-    for load in eq.scene.pose_loads:
-        X = load.place(eq.scene.rod)
-        if X is not None:
-            found.append(_posed(eq, load, X[None]))
-    return found
+def _wrench(load: Load, rod: Rod, X: Array, poses: np.ndarray) -> np.ndarray:
+    """Moments and forces at abscissas X in the world's axes, shape (X, 6)."""
+    if isinstance(load, PoseLoad):
+        posed = jax.vmap(lambda x, g: load.wrench(rod, x, g[:3, :3], g[:3, 3]))
+        return np.asarray(posed(X, jnp.asarray(poses)))
+    point = load.point(rod)
+    if point is not None:
+        wrench = np.asarray(jnp.stack(point[1]))[None]
+    else:
+        wrench = np.asarray(jax.vmap(lambda x: jnp.stack(load.density(rod, x) or ()))(X))
+    if load.frame == "world":
+        return wrench
+    return np.einsum("xij,xkj->xki", poses[:, :3, :3], wrench.reshape(-1, 2, 3)).reshape(-1, 6)
 
 
-def _densities(eq: Equilibrium, length: float) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Positions [m] and forces per length [N/m] in the world's axes of the dead and the follower
-    loads along the arm."""
-    X, found = jnp.linspace(0, length, 12), []
-    for frame in _FRAMES:
-        density = eq.scene.density(X, frame)
-        if density is not None:
-            found.append(_placed(eq, X, jnp.stack(density[3:], axis=-1), frame))
-    along = [load for load in eq.scene.pose_loads if load.place(eq.scene.rod) is None]
-    return found + [_posed(eq, load, X) for load in along]
-
-
-def _posed(eq: Equilibrium, load: PoseLoad, X: Array) -> tuple[np.ndarray, np.ndarray]:
-    """Positions at abscissas X, and the force there of a load that depends on the pose."""
-    poses = eq.pose(X)
-    wrench = jax.vmap(lambda x, g: load.wrench(eq.scene.rod, x, g[:3, :3], g[:3, 3]))(X, poses)
-    return np.asarray(poses[:, :3, 3]), np.asarray(wrench[:, 3:])
-
-
-def _placed(eq: Equilibrium, X: Array, force: Array, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-    """Positions at abscissas X, and the vectors there in the world's axes."""
-    poses, vectors = np.asarray(eq.pose(X)), np.asarray(force)
-    if frame == "body":
-        vectors = np.einsum("xij,xj->xi", poses[:, :3, :3], vectors)
-    return poses[:, :3, 3], vectors
+def _draw_arrows(ax: Axes3D, row: Row, arrows: np.ndarray, color: ColorType | None) -> None:
+    at_point = len(row.places) == 1
+    color = (COLORS[3] if at_point else COLORS[4]) if color is None else color
+    style: dict[str, Any] = {"color": color, "linewidth": 2.2 if at_point else 0.9}
+    dashes: dict[str, Any] = {"linestyle": (0, (2, 1))} if row.moment else {}
+    ax.quiver(*row.places.T, *arrows.T, arrow_length_ratio=0.25, **style, **dashes)
+    if not at_point:
+        ax.plot(*(row.places + arrows).T, **{**style, "linewidth": 0.6})
+    what = "moment" if row.moment else "force"
+    ax.plot(
+        [], [], [], label=f"{row.name}: {what} {row.greatest:.3g} {row.unit}", **style, **dashes
+    )
 
 
 def ellipsoid(
@@ -133,7 +169,7 @@ def ellipsoid(
 
     **Returns:** the axes.
     """
-    ax = _axes(ax)
+    ax = checked_space(ax)
     theta, phi = np.meshgrid(np.linspace(0, np.pi, 19), np.linspace(0, 2 * np.pi, 37))
     ball = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
     points = np.asarray(shape.centre)[:, None, None] + scale * np.einsum(
@@ -141,11 +177,4 @@ def ellipsoid(
     )
     ax.plot_surface(*points, color=color, alpha=alpha, linewidth=0, rasterized=True)
     equal_scale(ax)
-    return ax
-
-
-def _axes(ax: Axes3D | None) -> Axes3D:
-    if ax is None:
-        ax = plt.figure(figsize=(6, 5)).add_subplot(projection="3d")
-        ax.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
     return ax

@@ -3,27 +3,51 @@
 The package does not import this module on its own; use `from vsr_jax import plot`.
 """
 
+import textwrap
 from collections.abc import Sequence
 from typing import Any
 
-import jax
 import matplotlib.pyplot as plt
 import numpy as np
 from jax.typing import ArrayLike
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
-from matplotlib.ticker import MaxNLocator
+from matplotlib.collections import QuadMesh
+from matplotlib.colors import LogNorm
+from matplotlib.lines import Line2D
 from matplotlib.typing import ColorType, LineStyleType
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 
+from ..arm.loads import Gravity
 from ..arm.rod import STRAINS
 from ..solution.equilibrium import Equilibrium
-from ..solution.summary import Summary, stations as checked_stations
+from ..solution.summary import Summary
 from ..typing import VectorLike
 from ..validation import choice
+from . import annotate
+from .body import body_of, draw_body, sample
+from .space import (
+    THINNEST_BOX,
+    checked_space,
+    equal_scale,
+    fill,
+    fit_height,
+    label_axes,
+    world_frame,
+)
+from .style import COLORS, ink, shade, theme
+from .tendons import SLACK_DASHES, tension_bar, tension_scale
 
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""The palette of Okabe and Ito, which colour-blind readers can distinguish."""
+__all__ = [
+    "COLORS",
+    "LABELS",
+    "arm",
+    "equal_scale",
+    "sample",
+    "shade",
+    "strains",
+    "theme",
+    "workspace",
+]
 
 LABELS: dict[str, str] = dict(
     zip(
@@ -35,104 +59,103 @@ LABELS: dict[str, str] = dict(
 """Symbol and unit of each strain."""
 
 _LEAST_SPAN = 0.02
-_THINNEST_BOX = 0.35
+_THINNEST = 0.2
+"""Least side of the box of a figure of its own, relative to the longest."""
+_AREA, _BAR = (0.0, 0.0, 0.83, 0.9), (0.885, 0.25, 0.018, 0.5)
+"""Rectangles of the box and of the colour bar in the figure."""
 
-
-def sample(eq: Equilibrium, stations: VectorLike = 60) -> Summary:
-    """The summary of an equilibrium in NumPy arrays; `arm` and `strains` take it in place of `eq`.
-
-    **Arguments:** `stations`: number of stations, evenly spaced on the arm, or their abscissas [m].
-
-    **Raises:** `ValueError` for a batch of equilibria, for one that did not converge and for
-    stations beyond the arm.
-    """
-    if np.ndim(eq.status) > 0:
-        raise ValueError(f"eq: got a batch of shape {np.shape(eq.status)}, need one equilibrium")
-    if not bool(eq.converged):
-        raise ValueError(f"eq: got a solve that failed ({eq.message}), need a converged one")
-    return jax.tree.map(np.asarray, eq.summary(checked_stations(eq, stations, "stations")))
+_PAIRS = ((0, 1), (0, 2), (1, 2))
+"""Horizontal and vertical axis of each projection of a workspace."""
+_CELLS = (20, 60)
+"""Least and greatest number of cells along the longest side of a workspace."""
+_CLOUD, _CLOUD_BAR = (0.0, 0.5, 0.42, 0.48), (0.9, 0.25, 0.016, 0.5)
+"""Rectangles of the 3D axes and of the colour bar of a workspace in its figure."""
 
 
 def arm(
     eq: Equilibrium | Summary,
     ax: Axes3D | None = None,
     *,
-    color: ColorType = COLORS[0],
+    color: ColorType | None = None,
     label: str | None = None,
     linestyle: LineStyleType = "-",
     stations: VectorLike = 60,
     surface: bool = True,
     threads: bool = True,
+    details: bool | None = None,
     **line: Any,
 ) -> Axes3D:
-    """The deformed arm in 3D: its axis, its translucent outer wall and its threads, at equal scale.
+    """The deformed arm in 3D: its axis, its translucent outer wall or its discs, and its threads,
+    at equal scale.
+
+    With details, threads have the colour of their tension, with a colour bar (blue pushes,
+    vermilion pulls), and are dashed where they are slack; loads are arrows with a legend; the axes
+    of the world's frame and the direction of gravity are drawn. An arm too thin for its threads to
+    be told apart is drawn wider; the legend says by what factor.
+
+    Of a solve that failed, the arm at rest is drawn dimmed, with the message of the status.
 
     **Arguments:**
-    - `eq`: an equilibrium, or the result of `sample`.
+    - `eq`: an equilibrium, or the result of `sample`, which has no discs and no details.
     - `ax`: 3D axes; a new figure by default.
-    - `color`, `label`, `linestyle`, `line`: matplotlib properties of the axis curve.
+    - `color`, `label`, `linestyle`, `line`: matplotlib properties of the axis curve; the colour is
+      that of the wall too, by default blue, and grey with details.
     - `stations`: number of stations, or their abscissas [m]; not used with a `Summary`.
-    - `surface`, `threads`: whether to draw the wall and the threads.
+    - `surface`, `threads`: whether to draw the wall with the discs, and the threads.
+    - `details`: by default those of an equilibrium in a new figure.
 
     **Returns:** the axes.
     """
-    samples = eq if isinstance(eq, Summary) else sample(eq, stations)
-    ax = plt.figure(figsize=(6, 5)).add_subplot(projection="3d") if ax is None else ax
-    if not isinstance(ax, Axes3D):
-        raise ValueError(
-            f"ax: got {type(ax).__name__}, need 3D axes, as from "
-            f"figure.add_subplot(projection='3d')"
-        )
-    if surface:
-        x, y, z = np.moveaxis(np.asarray(samples.wall), -1, 0)
-        ax.plot_surface(
-            x,
-            y,
-            z,
-            color=color,
-            alpha=0.18,
-            linewidth=0,
-            rstride=1,
-            cstride=1,
-            rasterized=True,
-        )
-    if threads:
-        for thread in samples.threads:
-            ax.plot(*thread.T, color=shade(color), linewidth=0.8)
-    ax.plot(*samples.position.T, color=color, label=label, linestyle=linestyle, **line)
-    ax.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
-    equal_scale(ax)
+    own, ax = ax is None, checked_space(ax)
+    body = body_of(eq, stations)
+    details = isinstance(eq, Equilibrium) and (own if details is None else details)
+    scale = None if body.tension is None or not details else tension_scale([body.tension])
+    widening = body.widening if details else 1.0
+    if body.failure is not None:
+        label = textwrap.fill(f"{label or 'the arm'} at rest; no equilibrium: {body.failure}", 70)
+    shown = color if color is not None else ink(0.5) if details else COLORS[0]
+    style = {"color": shown, "linestyle": linestyle, "label": label, "scale": scale, **line}
+    draw_body(ax, body.widened(widening), surface=surface, threads=threads, **style)
+    if details and isinstance(eq, Equilibrium) and body.failure is None:
+        annotate.loads(eq, ax, legend=False)
+    label_axes(ax)
+    equal_scale(ax, thinnest=_THINNEST if own else THINNEST_BOX)
+    if own:
+        fit_height(ax, _AREA)
+    if details and isinstance(eq, Equilibrium):
+        world_frame(ax, _gravity(eq))
+    if details or body.failure is not None:
+        loose = body.slack if threads and body.failure is None else None
+        slack = loose is not None and bool(np.any(loose))
+        _legend(ax, slack, widening, own)
+    if own and threads and scale is not None:
+        tension_bar(ax, scale, _BAR)
     return ax
 
 
-def equal_scale(ax: Axes3D, *, zoom: float = 1.1) -> None:
-    """Sets one scale for x, y and z: the box has the proportions of the data, with no side shorter
-    than about a third of the longest.
+def _gravity(eq: Equilibrium) -> np.ndarray | None:
+    """Sum of the accelerations of gravity [m/s^2], None without gravity."""
+    found = [load.acceleration for load in eq.scene.loads if isinstance(load, Gravity)]
+    return np.sum(np.asarray(found), axis=0) if found else None
 
-    **Arguments:** `ax`: 3D axes; `zoom`: size of the box in them.
-    """
-    low = np.array([*ax.xy_dataLim.min, ax.zz_dataLim.x0])
-    high = np.array([*ax.xy_dataLim.max, ax.zz_dataLim.x1])
-    span = np.maximum(high - low, _THINNEST_BOX * np.max(high - low)) * 1.04
-    sides = zip(
-        *_around((low + high) / 2, span),
-        span / span.max(),
-        (ax.xaxis, ax.yaxis, ax.zaxis),
-        ("x", "y", "z"),
-        strict=True,
-    )
-    for start, end, width, axis, name in sides:
-        ticks = MaxNLocator(4 if width > 0.6 else 2, steps=[1, 2, 2.5, 4, 5, 10]).tick_values(
-            start, end
+
+def _legend(ax: Axes3D, slack: bool, widening: float, own: bool) -> None:
+    """Legend of what is drawn, slack tendons and the factor of the section, in the corner of the
+    figure or of the axes."""
+    handles = list(ax.get_legend_handles_labels()[0])
+    if slack:
+        handles.append(Line2D([], [], color=ink(0.6), linestyle=SLACK_DASHES, label="slack tendon"))
+    if widening > 1:
+        text = f"section drawn {widening:g} times as wide"
+        handles.append(Line2D([], [], linestyle="none", label=text))
+    if handles:
+        corner = {"bbox_to_anchor": (0.01, 0.99), "bbox_transform": ax.figure.transFigure}
+        ax.legend(
+            handles=handles,
+            loc="upper left",
+            ncols=1 + (len(handles) > 2),
+            **(corner if own else {}),
         )
-        margin = 0.06 * (end - start)  # ticks at a corner would overlap those of the next side
-        axis.set_ticks(ticks[(ticks > start + margin) & (ticks < end - margin)])
-        ax.set(**{f"{name}lim": (start, end)})
-    ax.set_box_aspect(span, zoom=zoom)  # pyright: ignore[reportArgumentType] (its default is an int)
-
-
-def _around(middle: np.ndarray, span: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return middle - span / 2, middle + span / 2
 
 
 def strains(
@@ -161,7 +184,8 @@ def strains(
     """
     indices = [STRAINS.index(choice("names", name, STRAINS)) for name in names]
     samples = eq if isinstance(eq, Summary) else sample(eq, stations)
-    axes = _panels(len(indices)) if ax is None else np.asarray(ax, dtype=object).reshape(-1)
+    own = ax is None
+    axes = _panels(len(indices)) if own else np.asarray(ax, dtype=object).reshape(-1)
     if len(axes) != len(indices):
         raise ValueError(f"ax: got {len(axes)} axes, need {len(indices)}, one per name")
     for panel, name, index in zip(axes, names, indices, strict=True):
@@ -175,8 +199,11 @@ def strains(
         )
         panel.set(xlabel="X [m]", ylabel=LABELS[name], xlim=(samples.X.min(), samples.X.max()))
         panel.ticklabel_format(axis="y", useOffset=False)
+        if own:
+            panel.set_title(name.replace("_", " about " if "bending" in name else " along "))
         low, high = panel.dataLim.intervaly
-        panel.set_ylim(*_around((low + high) / 2, max(1.12 * (high - low), _LEAST_SPAN)))
+        middle, half = (low + high) / 2, max(1.12 * (high - low), _LEAST_SPAN) / 2
+        panel.set_ylim(middle - half, middle + half)
     return axes
 
 
@@ -206,40 +233,72 @@ def workspace(
     - `positions`: shape (samples, 3) [m]; rows with a NaN are left out.
     - `ax`: four axes, the first one 3D; a new figure by default.
     - `values`, `label`: one number per point that sets its colour, and the label of the colour bar;
-      without `values` all points have the colour `color`.
+      without `values` the projections show the density: the number of tips in each cell, of all
+      points.
+    - `color`: of the points in space without `values`.
     - `most`: maximum number of points drawn; larger sets are subsampled evenly.
 
     **Returns:** the axes: 3D, then y over x, z over x, z over y.
+
+    **Raises:** `ValueError` for positions of another shape, and without any finite one.
     """
     positions = np.asarray(positions)
     if positions.ndim != 2 or positions.shape[1] != 3:
         raise ValueError(f"positions: got shape {positions.shape}, need (samples, 3)")
-    shown = np.flatnonzero(np.all(np.isfinite(positions), axis=1))
-    shown = shown[:: -(-len(shown) // most) or 1]
+    finite = np.flatnonzero(np.all(np.isfinite(positions), axis=1))
+    if not finite.size:
+        raise ValueError("positions: got no finite row, need at least one")
+    shown = finite[:: -(-len(finite) // most)]
     axes = _corner() if ax is None else np.asarray(ax, dtype=object).reshape(-1)
-    points = positions[shown].T
-    style: dict[str, Any] = {"s": 2, "linewidths": 0, "rasterized": True}
-    style |= {"c": color} if values is None else {"c": np.asarray(values)[shown], "cmap": "viridis"}
-    cloud = axes[0].scatter(*points, alpha=0.5, **style)
-    axes[0].set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+    style: dict[str, Any] = {"s": 3, "linewidths": 0, "rasterized": True}
+    style |= {"c": color} if values is None else {"c": np.asarray(values)[shown]}
+    points = axes[0].scatter(*positions[shown].T, alpha=0.5, **style)
+    label_axes(axes[0])
     equal_scale(axes[0])
-    for panel, (i, j) in zip(axes[1:], ((0, 1), (0, 2), (1, 2)), strict=True):
-        panel.scatter(points[i], points[j], **style)
+    if ax is None:
+        fill(axes[0], _CLOUD)
+    for panel, (i, j) in zip(axes[1:], _PAIRS, strict=True):
+        if values is not None:
+            panel.scatter(positions[shown, i], positions[shown, j], **style)
         panel.set(xlabel=f"{'xyz'[i]} [m]", ylabel=f"{'xyz'[j]} [m]")
-        panel.set_aspect("equal", adjustable="box")
-    if values is not None:
-        axes[0].figure.colorbar(cloud, ax=list(axes), label=label, shrink=0.6).solids.set_alpha(1)
+        panel.set_aspect("equal", adjustable="datalim" if ax is None else "box")
+        panel.use_sticky_edges = False
+        panel.margins(0.05)
+        panel.locator_params(nbins=5)
+    if values is None:
+        points = _draw_density(axes[1:], positions[finite])
+    figure, text = axes[0].figure, "tips per cell" if values is None else label
+    place = (
+        {"cax": figure.add_axes(_CLOUD_BAR)} if ax is None else {"ax": list(axes), "shrink": 0.6}
+    )
+    figure.colorbar(points, label=text, **place).solids.set_alpha(1)
     return axes
 
 
 def _corner() -> np.ndarray:
-    figure = plt.figure(figsize=(9, 7), layout="constrained")
-    return np.array(
-        [figure.add_subplot(2, 2, i + 1, projection="3d" if i == 0 else None) for i in range(4)],
-        dtype=object,
-    )
+    figure = plt.figure(figsize=(8.6, 6.8))
+    grid = figure.add_gridspec(2, 2, left=0.09, right=0.86, bottom=0.08, top=0.96, wspace=0.28)
+    space = figure.add_subplot(grid[0], projection="3d")
+    space.view_init(22, -60)
+    panels = [figure.add_subplot(grid[i]) for i in (1, 2, 3)]
+    return np.array([space, *panels], dtype=object)
 
 
-def shade(color: ColorType) -> tuple[float, ...]:
-    """A darker shade of a colour, for lines drawn over it."""
-    return tuple(0.55 * part for part in to_rgb(color))
+def _draw_density(panels: Sequence[Axes] | np.ndarray, tips: np.ndarray) -> QuadMesh:
+    """Number of tips in each cell of the projections, on one logarithmic scale."""
+    cells = np.clip(np.sqrt(len(tips)) / 2, *_CELLS)
+    cell = np.max(np.ptp(tips, axis=0)) / cells or 1.0
+    ends = zip(tips.min(axis=0), tips.max(axis=0), strict=True)
+    # the outermost tips lie in the middle of a cell, where rounding does not move them to another
+    edges = [np.arange(low - cell / 2, high + cell, cell) for low, high in ends]
+    counts = [
+        np.histogram2d(tips[:, i], tips[:, j], bins=[edges[i], edges[j]])[0] for i, j in _PAIRS
+    ]
+    scale = LogNorm(1, max(2, *(np.max(count) for count in counts)))
+    meshes = [
+        panel.pcolormesh(
+            edges[i], edges[j], np.ma.masked_equal(count.T, 0), norm=scale, rasterized=True
+        )
+        for panel, (i, j), count in zip(panels, _PAIRS, counts, strict=True)
+    ]
+    return meshes[0]

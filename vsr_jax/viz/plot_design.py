@@ -1,7 +1,9 @@
 """Figures of a design: history of the objective, the arm before and after."""
 
 from collections.abc import Sequence
+from typing import Any
 
+import jax
 import matplotlib.pyplot as plt
 import numpy as np
 from jax.typing import ArrayLike
@@ -11,9 +13,11 @@ from mpl_toolkits.mplot3d import Axes3D
 from ..arm.scene import Scene
 from ..models.base import Model
 from ..optimization.design_search import Design
+from ..optimization.objective import CurveError, Objective, TipError
 from ..solution.solver import solve
 from . import plot
-from .plot import COLORS
+from .space import checked_space, equal_scale, fit_height
+from .style import COLORS, ink
 
 
 def history(design: Design, ax: Axes | None = None) -> Axes:
@@ -33,7 +37,7 @@ def history(design: Design, ax: Axes | None = None) -> Axes:
         style = (
             {"color": COLORS[0], "linewidth": 2.0, "label": "best start"}
             if i == best
-            else {"color": "0.7", "linewidth": 0.9}
+            else {"color": ink(0.35), "linewidth": 0.9}
         )
         ax.plot(np.arange(1, len(so_far) + 1), so_far[:, i], **style)
     if np.nanmin(so_far, initial=np.inf) > 0:
@@ -50,18 +54,50 @@ def before_after(
     ax: Axes3D | None = None,
     *,
     model: Model | None = None,
+    targets: ArrayLike | Objective | None = None,
 ) -> Axes3D:
-    """The arm of the initial scene, if it has an equilibrium, and the arm of the design for its
-    first set of inputs.
+    """The arms of the initial scene that have an equilibrium (dashed) and the arms of the design,
+    one for each set of inputs.
 
-    **Arguments:** `scene`, `inputs`: before the design; `ax`: 3D axes, new ones by default;
-    `model`: as for `solve`.
+    **Arguments:** `scene`, `inputs`: before the design, one set of inputs or several, shape (sets,
+    actuators); `ax`: 3D axes, new ones by default; `model`: as for `solve`; `targets`: drawn as
+    crosses, positions [m], shape (..., 3), or the objective that has them.
 
     **Returns:** the axes.
     """
-    before = solve(scene, inputs, model=model)
-    if bool(before.converged):
-        ax = plot.arm(before, ax, color=COLORS[1], label="before", linestyle="--")
-    space = plot.arm(solve(design.scene, design.inputs[0], model=model), ax, label="after")
-    space.legend(frameon=False)
-    return space
+    own, ax = ax is None, checked_space(ax)
+    sets = np.atleast_2d(np.asarray(inputs))
+    before = [solve(scene, row, model=model) for row in sets]
+    after = [solve(design.scene, row, model=model) for row in design.inputs]
+    for name, arms, color, line in (
+        ("before", before, COLORS[1], "--"),
+        ("after", after, COLORS[0], "-"),
+    ):
+        solved = [eq for eq in arms if bool(eq.converged)]
+        for i, eq in enumerate(solved):
+            label = None if i else name
+            style: dict[str, Any] = {"color": color, "label": label, "linestyle": line}
+            plot.arm(eq, ax, stations=40, **style)
+    points = np.asarray(_targets(targets) if isinstance(targets, Objective) else targets)
+    if targets is not None and points.size:
+        cross: dict[str, Any] = {"color": ink(), "marker": "x", "s": 28, "linewidths": 1.6}
+        crosses: Any = points.reshape(-1, 3).T
+        ax.scatter(*crosses, label="target", depthshade=False, **cross)
+    equal_scale(ax, thinnest=0.2)
+    if own:
+        fit_height(ax, (0.0, 0.0, 0.95, 0.92))
+    corner = {"bbox_to_anchor": (0.01, 0.99), "bbox_transform": ax.figure.transFigure}
+    ax.legend(loc="upper left", ncols=3, **(corner if own else {}))
+    return ax
+
+
+def _targets(objective: Objective) -> np.ndarray:
+    """Positions [m] that an objective asks for, those of its terms too, shape (points, 3)."""
+    found = []
+    for part in jax.tree.leaves(objective, is_leaf=lambda x: isinstance(x, TipError | CurveError)):
+        if isinstance(part, TipError):
+            poses = np.asarray(part.targets)
+            found.append(poses if poses.ndim == 2 else poses[:, :3, 3])
+        elif isinstance(part, CurveError):
+            found.append(np.asarray(part.points).reshape(-1, 3))
+    return np.concatenate([np.zeros((0, 3)), *found])

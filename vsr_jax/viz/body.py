@@ -1,0 +1,147 @@
+"""One arm in space: its shape at stations, its tensions, its discs, and how they are drawn; also of
+an arm whose solve failed."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.typing import ColorType
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+from mpl_toolkits.mplot3d.axes3d import Axes3D
+
+from ..arm.scene import Scene
+from ..solution.equilibrium import Equilibrium
+from ..solution.solver import solve
+from ..solution.summary import Summary, stations as checked_stations
+from ..typing import VectorLike
+from .style import ink, shade
+from .tendons import TensionScale, draw_threads, is_slack
+
+_DISCS = 13
+_ANGLES = np.linspace(0.0, 2 * np.pi, 33)
+
+_THIN, _DRAWN = 0.01, 0.03
+"""Radius of an arm relative to its extent below which its section is drawn wider, and how wide."""
+
+
+def sample(eq: Equilibrium, stations: VectorLike = 60) -> Summary:
+    """The summary of an equilibrium in NumPy arrays; `arm` and `strains` take it in place of `eq`.
+
+    **Arguments:** `stations`: number of stations, evenly spaced on the arm, or their abscissas [m].
+
+    **Raises:** `ValueError` for a batch of equilibria, for one that did not converge and for
+    stations beyond the arm.
+    """
+    if np.ndim(eq.status) > 0:
+        raise ValueError(f"eq: got a batch of shape {np.shape(eq.status)}, need one equilibrium")
+    if not bool(eq.converged):
+        raise ValueError(f"eq: got a solve that failed ({eq.message}), need a converged one")
+    at = checked_stations(eq, stations, "stations")
+    return jax.tree.map(np.asarray, eq.summary(at, ("forces",)))
+
+
+class Body(NamedTuple):
+    """An arm as it is drawn: its `samples`; the `tension` of its threads [N] and which are
+    `slack`, None where they are not known; its `discs` [m], shape (discs, angles, 3); the
+    `failure` of the solve, in which case the shape is that at rest."""
+
+    samples: Summary
+    tension: np.ndarray | None
+    slack: np.ndarray | None
+    discs: np.ndarray
+    failure: str | None = None
+
+    def widened(self, factor: float) -> "Body":
+        """The arm with everything across it larger by a factor."""
+        axis = np.asarray(self.samples.position)
+        wall = axis[:, None] + factor * (self.samples.wall - axis[:, None])
+        threads = axis + factor * (self.samples.threads - axis)
+        middle = self.discs.mean(axis=1, keepdims=True)
+        samples = eqx.tree_at(lambda s: (s.wall, s.threads), self.samples, (wall, threads))
+        return self._replace(samples=samples, discs=middle + factor * (self.discs - middle))
+
+    @property
+    def points(self) -> np.ndarray:
+        """All points that are drawn [m], shape (points, 3)."""
+        return np.concatenate([self.samples.wall.reshape(-1, 3), self.discs.reshape(-1, 3)])
+
+    @property
+    def widening(self) -> float:
+        """Factor by which the section must be wider for its threads to be told apart, 1 for an arm
+        that is not thin; two digits."""
+        axis = np.asarray(self.samples.position)
+        radius = np.max(np.linalg.norm(self.samples.wall - axis[:, None], axis=-1))
+        if self.discs.size:
+            middle = self.discs.mean(axis=1, keepdims=True)
+            radius = max(radius, np.max(np.linalg.norm(self.discs - middle, axis=-1)))
+        extent = np.max(np.ptp(axis, axis=0))
+        return float(f"{_DRAWN * extent / radius:.2g}") if radius < _THIN * extent else 1.0
+
+
+def body_of(eq: Equilibrium | Summary, stations: VectorLike = 60) -> Body:
+    """The arm of an equilibrium; of one that failed the arm at rest.
+
+    **Raises:** `ValueError` as `sample`, except for a solve that failed.
+    """
+    if isinstance(eq, Summary):
+        return Body(eq, None, None, np.zeros((0, 1, 3)))
+    if np.ndim(eq.status) == 0 and not bool(eq.converged):
+        return body_of(at_rest(eq), stations)._replace(failure=eq.message)
+    samples = sample(eq, stations)
+    tension = -np.asarray(samples.values["forces"])
+    return Body(samples, tension, is_slack(eq, tension), _discs(eq, samples))
+
+
+def at_rest(eq: Equilibrium) -> Equilibrium:
+    """The arm without loads and inputs."""
+    scene = Scene(eq.scene.rod, eq.scene.actuators, free_strains=eq.scene.free_strains)
+    return solve(scene, jnp.zeros_like(eq.inputs), model=eq.model)
+
+
+def _discs(eq: Equilibrium, samples: Summary) -> np.ndarray:
+    """Rims of the discs that guide the threads, evenly along the arm: shape (discs, angles, 3)."""
+    radius = eq.scene.rod.guide_radius
+    if radius is None:
+        return np.zeros((0, len(_ANGLES), 3))
+    chosen = np.unique(np.linspace(0, len(samples.X) - 1, _DISCS).astype(int))
+    pose = np.asarray(samples.pose)[chosen]
+    rim = float(radius) * np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])
+    return pose[:, None, :3, 3] + np.einsum("dij,ja->dai", pose[:, :3, 1:3], rim)
+
+
+def draw_body(
+    ax: Axes3D,
+    body: Body,
+    *,
+    color: ColorType,
+    surface: bool = True,
+    threads: bool = True,
+    scale: TensionScale | None = None,
+    **line: Any,
+) -> None:
+    """The wall with the discs, the threads and the axis of an arm.
+
+    **Arguments:** `scale`: the colours of tensions, by default a shade of `color`; `line`:
+    properties of the axis. An arm at rest after a solve that failed is grey and dashed.
+    """
+    if body.failure is not None:
+        color, scale = ink(0.45), None
+        line = {**line, "linestyle": "--"}
+    if surface:
+        x, y, z = np.moveaxis(np.asarray(body.samples.wall), -1, 0)
+        options = {"linewidth": 0, "rstride": 1, "cstride": 1, "rasterized": True}
+        ax.plot_surface(x, y, z, color=color, alpha=0.18, **options)
+        if len(body.discs):
+            rims = Poly3DCollection(body.discs, facecolors=[color], edgecolors=[color], alpha=0.2)
+            ax.add_collection3d(rims, autolim=False)
+            ax.auto_scale_xyz(*body.discs.reshape(-1, 3).T, had_data=True)
+    paths = np.asarray(body.samples.threads)[: None if threads else 0]
+    if scale is None or body.tension is None or body.slack is None:
+        for path in paths:
+            ax.plot(*path.T, color=shade(color), linewidth=0.8)
+    elif threads:
+        draw_threads(ax, paths, body.tension, body.slack, scale)
+    width: dict[str, Any] = {} if scale is None else {"linewidth": 0.8}
+    ax.plot(*body.samples.position.T, color=color, **(width | line))
