@@ -48,7 +48,7 @@ COMMANDS = {
     ),
     "export": Command(
         "fabrication_commands",
-        "write files for the workshop: body, thread curves, drilling plan, lengths",
+        "write files for the workshop: body, threads, holes, lengths",
         "vsr-jax export scene.toml --stl arm.stl --step arm.step --csv threads.csv",
     ),
     "paper": Command(
