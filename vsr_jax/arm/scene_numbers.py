@@ -1,4 +1,4 @@
-"""The numbers of a scene by name, with their units. Sensitivities and designs use these names.
+"""The numbers of a scene by name, with their units. Sensitivities, designs and fits use these names.
 
 Names consist of constructor arguments, as in a scene file: `rod.section.radius.base`,
 `actuators[0].routing.angle`, `loads[1].force`. A profile that is a plain number has the name of the
@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from functools import reduce
 from operator import attrgetter, itemgetter
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import numpy as np
@@ -21,6 +21,7 @@ from .fields import Unit, coefficient_unit, item_unit, unit_of
 from .scene import Scene
 
 Way = tuple[Callable[[Any], Any], ...]
+Module = TypeVar("Module", bound=eqx.Module)
 
 
 class Parameter(NamedTuple):
@@ -48,7 +49,12 @@ class Parameter(NamedTuple):
 
 def parameters(scene: Scene) -> dict[str, Parameter]:
     """Every number of a scene by its name: its `value`, and its `unit` if known."""
-    return dict(_walk(scene, "", "", False, ()))
+    return numbers_of(scene)
+
+
+def numbers_of(part: eqx.Module) -> dict[str, Parameter]:
+    """Every number of a scene or of another module by its name."""
+    return dict(_walk(part, "", "", False, ()))
 
 
 def matching(pattern: str, known: Mapping[str, object]) -> list[str]:
@@ -56,7 +62,7 @@ def matching(pattern: str, known: Mapping[str, object]) -> list[str]:
 
     **Raises:** `ValueError` if no name matches.
     """
-    form = re.compile(re.escape(pattern).replace(r"\[\*\]", r"\[\d+\]"))
+    form = re.compile(re.escape(pattern).replace(r"\[\*\]", r"\[[^]]+\]"))
     names = [name for name in known if form.fullmatch(name)]
     if not names:
         close = difflib.get_close_matches(pattern, known, n=1)
@@ -65,14 +71,14 @@ def matching(pattern: str, known: Mapping[str, object]) -> list[str]:
     return names
 
 
-def replaced(scene: Scene, values: Mapping[str, Array]) -> Scene:
-    """The scene with new values of the named numbers."""
-    known = parameters(scene)
+def replaced(part: Module, values: Mapping[str, Array]) -> Module:
+    """A scene, or another module, with new values of the named numbers."""
+    known = numbers_of(part)
     ways = [known[name].way for name in values]
     return (
-        eqx.tree_at(lambda s: [_at(s, way) for way in ways], scene, list(values.values()))
+        eqx.tree_at(lambda s: [_at(s, way) for way in ways], part, list(values.values()))
         if ways
-        else scene
+        else part
     )
 
 
