@@ -116,7 +116,7 @@ def affine(
     for k, column in enumerate(columns):
         for slot, kind, group in column.acts:
             here = np.array([one == group for one in series]) if kind == "series" else 1.0
-            A[:, slots[slot], k] = inputs[:, slot[1]] if kind == "gain" else here
+            A[:, slots[slot], k] += inputs[:, slot[1]] if kind == "gain" else here
     return b, A
 
 
