@@ -20,6 +20,7 @@ PACKAGES = (
     "files",
     "analysis",
     "optimization",
+    "calibration",
     "viz",
     "studies",
     "cli",

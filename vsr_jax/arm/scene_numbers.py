@@ -1,4 +1,4 @@
-"""The numbers of a scene by name, with their units. Sensitivities, designs and fits use these names.
+"""The numbers of a scene by name, with their units: names for sensitivities, designs and fits.
 
 Names consist of constructor arguments, as in a scene file: `rod.section.radius.base`,
 `actuators[0].routing.angle`, `loads[1].force`. A profile that is a plain number has the name of the

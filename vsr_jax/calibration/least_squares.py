@@ -13,7 +13,7 @@ parameter in Marquardt's method (1999), for $\lambda$; James, Roos, MINUIT (1975
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,16 +23,20 @@ _HUBER, _CAUCHY = 1.345, 2.385
 _LEAST_GAIN = 1e-6
 _NOISE_GAIN = 1e-2
 """Expected decrease below which a step that gains nothing means rounding, not failure."""
-_MOST_DAMPING = 1e12
+_FIRST_DAMPING, _TRIALS, _LEAST_RATIO = 1e-3, 9, 1e-4
+"""Damping of the first step; how often it is raised, by 2, 4, 8 ..., for one step; share of the
+foreseen decrease that a step has to bring."""
 
 
 class Residuals(NamedTuple):
     """Residuals in standard deviations, shape (shapes, residuals), zero where nothing is known, and
-    their derivatives (shapes, residuals, unknowns); whether each shape was `solved`."""
+    their derivatives (shapes, residuals, unknowns); whether each shape was `solved`; the `source`
+    that they were computed from."""
 
     value: np.ndarray
     slopes: np.ndarray
     solved: np.ndarray
+    source: Any = None
 
 
 class Box(NamedTuple):
@@ -82,56 +86,83 @@ def normal_matrix(residuals: Residuals, weights: np.ndarray) -> np.ndarray:
 
 
 def minimise(
-    evaluate: Callable[[np.ndarray], Residuals],
+    evaluate: Callable[[np.ndarray, Residuals | None], Residuals],
     start: np.ndarray,
     box: Box,
     *,
     loss: str = "linear",
     steps: int = 100,
+    near: Residuals | None = None,
     report: Callable[[int, float], None] = lambda step, cost: None,
 ) -> Minimum:
     """Steps from a start to a minimum.
 
-    **Arguments:** `report`: called with the number of steps and the cost.
+    **Arguments:** `evaluate`: residuals at a point, given those of a point near by, if there is
+    one; `near`: those for the start; `report`: called with the number of steps and the cost.
     """
-    x, damping, growth, scale = start, 1e-3, 2.0, np.zeros(start.size)
-    here = evaluate(x)
-    cost, reason, converged, step = _cost(here, here.solved, x, box, loss), "", False, 0
-    while True:
-        _, weights, _ = loss_of(loss, here.value)
-        A = normal_matrix(here, weights) + np.diag(box.sd**-2.0)
-        slope = np.einsum("sr,sr,srk->k", weights, here.value, here.slopes)
-        slope = slope + (x - box.mean) / box.sd**2
-        fixed = (
-            (box.low == box.high) | ((x <= box.low) & (slope > 0)) | ((x >= box.high) & (slope < 0))
-        )
+    here, damping, scale = evaluate(start, near), _FIRST_DAMPING, np.zeros(start.size)
+    x = start
+    for step in range(steps + 1):
+        weights, cost = loss_of(loss, here.value)[1], _cost(here, here.solved, x, box, loss)
+        if step:
+            report(step, cost)
+        A, slope, fixed = _quadratic(here, weights, x, box)
         gain = _expected(A, slope, fixed) / _variance(here.value, start.size)
         if gain <= _LEAST_GAIN:
             return Minimum(x, here, weights, cost, step, True, "converged")
         if step == steps:
-            return Minimum(x, here, weights, cost, step, False, f"stopped after {steps} steps")
+            break
         scale = np.maximum(scale, np.diag(A))
-        while True:
-            trial = _step(x, A, slope, damping * np.where(scale > 0, scale, 1.0), fixed, box)
-            change = trial - x
-            there = evaluate(trial) if np.any(change) else here
-            kept = bool(np.all(there.solved | ~here.solved))
-            old = _cost(here, here.solved & there.solved, x, box, loss)
-            new = _cost(there, here.solved & there.solved, trial, box, loss)
-            foreseen = -(slope @ change) - 0.5 * change @ A @ change
-            ratio = (old - new) / foreseen if foreseen > 0 and kept and new < old else 0.0
-            if ratio > 1e-4:
-                damping *= max(1 / 3, 1 - (2 * ratio - 1) ** 3)
-                growth = 2.0
-                break
-            damping, growth = damping * growth, growth * 2
-            if damping > _MOST_DAMPING or not np.any(change):
-                done = gain <= _NOISE_GAIN
-                reason = "converged to rounding" if done else "no step lowers the cost"
-                return Minimum(x, here, weights, cost, step, done, reason)
-        x, here, step = trial, there, step + 1
-        cost = _cost(here, here.solved, x, box, loss)
-        report(step, cost)
+        size = np.where(scale > 0, scale, 1.0)
+        found = _descend(evaluate, x, here, (A, slope, fixed), size, damping, box, loss)
+        if found is None:
+            done = gain <= _NOISE_GAIN
+            reason = "converged to rounding" if done else "no step lowers the cost"
+            return Minimum(x, here, weights, cost, step, done, reason)
+        x, here, damping = found
+    return Minimum(x, here, weights, cost, steps, False, f"stopped after {steps} steps")
+
+
+def _quadratic(
+    here: Residuals, weights: np.ndarray, x: np.ndarray, box: Box
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Matrix and gradient of the quadratic model of the cost, and which unknowns are pushed against
+    a bound."""
+    A = normal_matrix(here, weights) + np.diag(box.sd**-2.0)
+    slope = np.einsum("sr,sr,srk->k", weights, here.value, here.slopes)
+    slope = slope + (x - box.mean) / box.sd**2
+    pushed = ((x <= box.low) & (slope > 0)) | ((x >= box.high) & (slope < 0))
+    return A, slope, pushed | (box.low == box.high)
+
+
+def _descend(
+    evaluate: Callable[[np.ndarray, Residuals | None], Residuals],
+    x: np.ndarray,
+    here: Residuals,
+    model: tuple[np.ndarray, np.ndarray, np.ndarray],
+    scale: np.ndarray,
+    damping: float,
+    box: Box,
+    loss: str,
+) -> tuple[np.ndarray, Residuals, float] | None:
+    """A point of lower cost at which no shape is lost, its residuals and the next damping; None if
+    there is none nearby."""
+    A, slope, fixed = model
+    growth = 2.0
+    for _ in range(_TRIALS):
+        trial = _step(x, A, slope, damping * scale, fixed, box)
+        change = trial - x
+        foreseen = -(slope @ change) - 0.5 * change @ A @ change
+        if foreseen <= 0:
+            return None
+        there = evaluate(trial, here)
+        old = _cost(here, here.solved, x, box, loss)
+        new = _cost(there, here.solved, trial, box, loss)
+        ratio = (old - new) / foreseen if np.all(there.solved | ~here.solved) else -1.0
+        if ratio > _LEAST_RATIO:
+            return trial, there, damping * max(1 / 3, 1 - (2 * ratio - 1) ** 3)
+        damping, growth = damping * growth, growth * 2
+    return None
 
 
 def _cost(residuals: Residuals, count: np.ndarray, x: np.ndarray, box: Box, loss: str) -> float:

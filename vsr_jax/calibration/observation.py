@@ -67,6 +67,11 @@ class Observation(eqx.Module):
         return ("",) * self.present.shape[1]
 
     @property
+    def blank(self) -> Array:
+        """A value of one shape for which the residual of a prediction has derivatives."""
+        return jnp.zeros(self.value.shape[1:], self.value.dtype)
+
+    @property
     def ratio(self) -> np.ndarray:
         """Standard deviations up to a common factor where `sd` is None, to be broadcast."""
         return np.ones(())
@@ -244,6 +249,10 @@ class Poses(Observation):
     def present(self) -> np.ndarray:
         seen = np.isfinite(np.asarray(self.value)).all(axis=(2, 3))
         return np.repeat(np.concatenate([seen, seen], axis=1)[..., None], 3, axis=2)
+
+    @property
+    def blank(self) -> Array:
+        return jnp.broadcast_to(jnp.eye(4, dtype=self.value.dtype), self.value.shape[1:])
 
     @property
     def ratio(self) -> np.ndarray:

@@ -1,20 +1,24 @@
-r"""Residuals of all shapes and their derivatives by the numbers that a fit changes, from one compiled
-program: $f_s(p)$ and $\partial f_s / \partial p$, by the implicit derivatives of the equilibria in
-forward mode."""
+r"""Residuals of all shapes and their derivatives by the numbers that a fit changes: $f_s(p)$ and
+$\partial f_s / \partial p$ from one compiled program, by the implicit derivatives of the equilibria
+in forward mode."""
 
 from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
+from ..arm.rod import STRAIGHT
 from ..arm.scene import Scene
 from ..arm.scene_numbers import numbers_of, replaced
-from ..models.base import Model
+from ..models.base import Model, Near, Outcome
+from ..models.strain_dependent import StrainDependent
 from ..numerics import se3
-from ..solution.solver import solve
+from ..solution.equilibrium import Equilibrium
+from ..solution.solver import outcome_of
 from .observation import Observation
 from .unknowns import INPUTS, POSITION, ROTATION, Slot
 
@@ -69,16 +73,40 @@ class Predictor(eqx.Module):
         return jnp.where(changed > lowest, changed, lowest)
 
     def residual(
-        self, numbers: Float[Array, " slots"], recorded: Array, values: tuple[Array, ...]
-    ) -> tuple[Array, Int[Array, ""]]:
-        """Residuals of one shape, shape (residuals,), and the status of its solve."""
+        self,
+        numbers: Float[Array, " slots"],
+        recorded: Array,
+        values: tuple[Array, ...],
+        guess: Outcome,
+    ) -> tuple[Array, Outcome]:
+        """Residuals of one shape, shape (residuals,), and the outcome of its solve, which starts
+        from that of numbers near by."""
         scene, observations = self.set_up(numbers)
-        eq = solve(scene, self.inputs(numbers, recorded), model=self.model)
+        inputs = self.inputs(numbers, recorded)
+        near = Near(self.model, self.scene, guess.forces, guess.state)
+        outcome = outcome_of(scene, inputs, self.model, near)
+        eq = Equilibrium(scene, inputs, self.model, outcome)
         parts = [
             one.residual(eq, value).reshape(-1)
             for one, value in zip(observations, values, strict=True)
         ]
-        return jnp.concatenate(parts), eq.status
+        return jnp.concatenate(parts), outcome
+
+    def unguessed(self, inputs: Float[Array, "shapes actuators"]) -> Outcome:
+        """Guesses where nothing is known: straight arms without forces. A solve that does not get
+        on from there starts as without a guess."""
+
+        def solved(inputs: Array) -> Outcome:
+            return outcome_of(self.scene, inputs, self.model)
+
+        kind = eqx.filter_eval_shape(jax.vmap(solved), inputs)
+        outcome = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), kind)
+        if isinstance(self.model, StrainDependent):
+            straight = tuple(
+                jnp.full_like(x, u) for x, u in zip(outcome.state.xi, STRAIGHT, strict=True)
+            )
+            outcome = outcome._replace(state=outcome.state._replace(xi=straight))
+        return outcome
 
     def _changed(self, part: eqx.Module, numbers: Array, prefix: str) -> dict[str, Array]:
         found = {
@@ -110,44 +138,57 @@ def _moved(scene: Scene, position: Array | None, rotation: Array | None) -> Scen
     return eqx.tree_at(lambda s: s.rod.base, scene, base, is_leaf=lambda x: x is None)
 
 
+class Linearised(NamedTuple):
+    """Residuals (shapes, residuals), their derivatives by the numbers (shapes, residuals, slots),
+    in double precision on the host, NaN where a solve failed; the outcomes of the solves."""
+
+    residual: np.ndarray
+    slopes: np.ndarray
+    outcome: Outcome
+
+
 def linearised(
     predictor: Predictor,
     numbers: np.ndarray,
     inputs: Float[Array, "shapes actuators"],
     values: tuple[Array, ...],
-    chunk: int,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Residuals (shapes, residuals), their derivatives by the numbers (shapes, residuals, slots)
-    and the status of each shape, in double precision on the host; NaN where a solve failed."""
+    *,
+    guess: Outcome | None = None,
+    chunk: int = CHUNK,
+) -> Linearised:
+    """Residuals of shapes and their derivatives.
+
+    **Arguments:** `numbers`, shape (shapes, slots); `guess`: outcomes for numbers near by, from
+    which the solves start; `chunk`: shapes that one call of the program solves side by side.
+    """
     shapes, parts = len(inputs), []
+    guess = predictor.unguessed(inputs) if guess is None else guess
     for first in range(0, shapes, chunk):
         # the last rows are filled up with copies, so that one program serves any number of shapes
         rows = np.minimum(np.arange(first, first + chunk), shapes - 1)
-        take = jnp.asarray(rows)
-        parts.append(
-            _linearised(
-                predictor,
-                jnp.asarray(numbers[rows], inputs.dtype),
-                inputs[take],
-                tuple(value[take] for value in values),
-            )
-        )
-    residual, slopes, status = (
-        np.concatenate([np.asarray(part[i]) for part in parts])[:shapes] for i in range(3)
+        here = jnp.asarray(numbers[rows], inputs.dtype)
+        known = jax.tree.map(lambda x, rows=rows: x[rows], (inputs, values, guess))
+        parts.append(_linearised(predictor, here, *known))
+    residual, slopes, outcome = jax.tree.map(
+        lambda *pieces: np.concatenate([np.asarray(piece) for piece in pieces])[:shapes], *parts
     )
-    return residual.astype(float), slopes.astype(float), status
+    return Linearised(residual.astype(float), slopes.astype(float), outcome)
 
 
 @eqx.filter_jit
 def _linearised(
-    predictor: Predictor, numbers: Array, inputs: Array, values: tuple[Array, ...]
-) -> tuple[Array, Array, Array]:
-    def one(numbers: Array, inputs: Array, values: tuple[Array, ...]) -> tuple[Array, Array, Array]:
-        def residual(x: Array) -> tuple[Array, tuple[Array, Array]]:
-            found, status = predictor.residual(x, inputs, values)
-            return found, (found, status)
+    predictor: Predictor,
+    numbers: Array,
+    inputs: Array,
+    values: tuple[Array, ...],
+    guess: Outcome,
+) -> tuple[Array, Array, Outcome]:
+    def one(numbers: Array, *known: Any) -> tuple[Array, Array, Outcome]:
+        def residual(x: Array) -> tuple[Array, tuple[Array, Outcome]]:
+            found, outcome = predictor.residual(x, *known)
+            return found, (found, outcome)
 
-        slopes, (found, status) = jax.jacfwd(residual, has_aux=True)(numbers)
-        return found, slopes, status
+        slopes, (found, outcome) = jax.jacfwd(residual, has_aux=True)(numbers)
+        return found, slopes, outcome
 
-    return jax.vmap(one)(numbers, inputs, values)
+    return jax.vmap(one)(numbers, inputs, values, guess)

@@ -3,14 +3,14 @@ for all shapes or some of them, with standard deviations that are given or estim
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Array
 
 from ..arm.scene import Scene
-from ..models.base import Status
+from ..models.base import Outcome, Status
 from ..models.strain_dependent import StrainDependent
 from ..typing import cast
 from .least_squares import Box, Minimum, Residuals, loss_of, minimise, normal_matrix
@@ -29,20 +29,23 @@ _NORMAL_MEDIAN = 0.6745
 
 class Evaluation(NamedTuple):
     """Residuals of all shapes in their own units, shape (shapes, residuals), their derivatives by
-    the unknowns, and the status of each shape."""
+    the unknowns, whether each shape was `solved`, and the outcomes of the solves."""
 
     residual: np.ndarray
     slopes: np.ndarray
-    status: np.ndarray
+    solved: np.ndarray
+    outcome: Outcome
 
 
 class Adjusted(NamedTuple):
     """A minimum: the unknowns `x`; the standard deviation of each residual, shape (shapes,
-    residuals); the residuals in standard deviations are in `minimum`."""
+    residuals); the residuals in standard deviations are in `minimum`; the `outcome` of each
+    solve."""
 
     x: np.ndarray
     sd: np.ndarray
     minimum: Minimum
+    outcome: Outcome
 
 
 @dataclass(frozen=True)
@@ -97,18 +100,25 @@ class FitProblem:
         return np.concatenate(parts, axis=1)
 
     def evaluate(
-        self, x: np.ndarray, inputs: Array, series: Sequence[str], values: tuple[Array, ...]
+        self,
+        x: np.ndarray,
+        inputs: Array,
+        series: Sequence[str],
+        values: tuple[Array, ...],
+        guess: Outcome | None = None,
     ) -> Evaluation:
-        """Residuals of any shapes."""
+        """Residuals of any shapes; `guess`: outcomes for unknowns near by."""
         b, A = affine(self.columns, self.predictor.slots, np.asarray(inputs, float), series)
         chunk = min(CHUNK, len(self.data))
-        residual, slopes, status = linearised(self.predictor, b + A @ x, inputs, values, chunk)
-        return Evaluation(residual, np.einsum("srl,slk->srk", slopes, A), status)
+        found = linearised(self.predictor, b + A @ x, inputs, values, guess=guess, chunk=chunk)
+        slopes = np.einsum("srl,slk->srk", found.slopes, A)
+        solved = np.asarray(found.outcome.status) == Status.CONVERGED
+        return Evaluation(found.residual, slopes, solved, found.outcome)
 
-    def at(self, x: np.ndarray) -> Evaluation:
+    def at(self, x: np.ndarray, guess: Outcome | None = None) -> Evaluation:
         """Residuals of the measured shapes."""
         values = tuple(one.value for one in self.data.observations)
-        return self.evaluate(x, self.data.inputs, self.data.series, values)
+        return self.evaluate(x, self.data.inputs, self.data.series, values, guess)
 
     def adjust(
         self,
@@ -117,53 +127,58 @@ class FitProblem:
         used: np.ndarray | None = None,
         box: Box | None = None,
         sd: np.ndarray | None = None,
+        guess: Outcome | None = None,
         report: Any = lambda step, cost: None,
     ) -> Adjusted:
         """The minimum nearest to a start.
 
         **Arguments:** `used`: which shapes count; `box`: other bounds and priors; `sd`: standard
-        deviations, which then are not estimated.
+        deviations, which then are not estimated; `guess`: outcomes for unknowns near by.
         """
         box = self.box if box is None else box
         used = np.ones(len(self.data), bool) if used is None else used
         known = sd is not None or not np.any(self.estimated)
-        sizes = self.unit_sd if sd is None else sd
-        if not known:
-            first = self.at(start)
-            sizes = self.unit_sd * self._factors(first, used, np.zeros(self.owner.size))
+        first = self.at(start, guess)
+        if sd is None:
+            lost = np.zeros(self.owner.size)
+            sd = self.unit_sd if known else self.unit_sd * self._factors(first, used, lost)
+
+        def evaluate(x: np.ndarray, near: Residuals | None, sd: np.ndarray) -> Residuals:
+            at = first if near is None else self.at(x, near.source.outcome)
+            return self._scaled(at, sd, used)
+
+        near = None
         for _ in range(_ROUNDS):
             found = minimise(
-                lambda x, sizes=sizes: self._scaled(self.at(x), sizes, used),
+                partial(evaluate, sd=sd),
                 start,
                 box,
                 loss=self.loss,
                 steps=self.steps,
+                near=near,
                 report=report,
             )
+            at, old, near, start = found.residuals.source, sd, found.residuals, found.x
             if known:
                 break
-            old, start = sizes, found.x
-            sizes = self.unit_sd * self._factors_at(found, old, used, box)
-            if np.all(np.abs(sizes / old - 1) < _SAME):
+            sd = self.unit_sd * self._factors(at, used, self._lost(found, box))
+            if np.all(np.abs(sd / old - 1) < _SAME):
                 break
-        return Adjusted(found.x, sizes, self._rescaled(found, sizes, used))
-
-    def _rescaled(self, found: Minimum, sizes: np.ndarray, used: np.ndarray) -> Minimum:
-        scaled = self._scaled(self.at(found.x), sizes, used)
-        return found._replace(residuals=scaled, weights=loss_of(self.loss, scaled.value)[1])
+        scaled = self._scaled(at, sd, used)
+        found = found._replace(residuals=scaled, weights=loss_of(self.loss, scaled.value)[1])
+        return Adjusted(found.x, sd, found, at.outcome)
 
     def _scaled(self, at: Evaluation, sd: np.ndarray, used: np.ndarray) -> Residuals:
         """Residuals in standard deviations, zero where there is nothing to count."""
-        solved = at.status == Status.CONVERGED
-        count = (solved & used)[:, None] & self.data.present
+        count = (at.solved & used)[:, None] & self.data.present
         value = np.where(count, at.residual / sd, 0.0)
         slopes = np.where(count[..., None], at.slopes / sd[..., None], 0.0)
-        return Residuals(value, slopes, solved | ~used)
+        return Residuals(value, slopes, at.solved | ~used, at)
 
     def _factors(self, at: Evaluation, used: np.ndarray, lost: np.ndarray) -> np.ndarray:
         """Estimated standard deviation of each residual in units of `unit_sd`; `lost`: degrees of
         freedom that each residual lost to the unknowns, summed over the shapes."""
-        solved = (at.status == Status.CONVERGED) & used
+        solved = at.solved & used
         factors = np.ones(self.owner.size)
         for i in np.flatnonzero(self.estimated):
             mine = self.owner == i
@@ -176,14 +191,14 @@ class FitProblem:
                 factors[mine] = np.median(np.abs(f)) / _NORMAL_MEDIAN * np.sqrt(f.size / free)
         return np.where(factors > 0, factors, np.finfo(float).tiny ** 0.25)
 
-    def _factors_at(self, found: Minimum, sd: np.ndarray, used: np.ndarray, box: Box) -> np.ndarray:
+    def _lost(self, found: Minimum, box: Box) -> np.ndarray:
+        """Degrees of freedom that each residual lost to the unknowns, summed over the shapes."""
         slopes, weights = found.residuals.slopes, found.weights
         A = normal_matrix(found.residuals, weights) + np.diag(box.sd**-2.0)
         free = (box.high > box.low) & (np.diag(A) > 0)
         inverse = np.zeros_like(A)
         inverse[np.ix_(free, free)] = np.linalg.pinv(A[np.ix_(free, free)], hermitian=True)
-        lost = np.einsum("sr,srk,kl,srl->r", weights, slopes, inverse, slopes)
-        return self._factors(self.at(found.x), used, lost)
+        return np.einsum("sr,srk,kl,srl->r", weights, slopes, inverse, slopes)
 
 
 def formulate(

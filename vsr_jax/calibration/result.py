@@ -126,7 +126,7 @@ class Fit:
         """Measured numbers that count, less the unknowns that are free without a prior."""
         box = self.problem.box
         free = np.sum((box.high > box.low) & ~np.isfinite(box.sd))
-        return int(np.sum(self._counted) - free)
+        return int(np.sum(self.counted) - free)
 
     @property
     def reduced_chi_squared(self) -> float:
@@ -135,7 +135,8 @@ class Fit:
         return self.chi_squared / self.freedom if self.freedom > 0 else float("nan")
 
     @property
-    def _counted(self) -> np.ndarray:
+    def counted(self) -> np.ndarray:
+        """Whether each number was measured and its shape solved, shape (shapes, residuals)."""
         solved = self.adjusted.minimum.residuals.solved
         return self.problem.data.present & solved[:, None]
 
@@ -144,7 +145,7 @@ class Fit:
         """Predicted minus measured values by label, shape (shapes, components) and in the unit of
         the measurement; NaN where nothing was measured or the solve failed."""
         scaled = self.adjusted.minimum.residuals.value * self.adjusted.sd
-        return by_label(self.problem, np.where(self._counted, scaled, np.nan))
+        return by_label(self.problem, np.where(self.counted, scaled, np.nan))
 
     def rms(self, series: str | None = None) -> dict[str, float]:
         """Root mean square length of the residual of each label, of all shapes or of a series."""
@@ -197,11 +198,8 @@ class Fit:
         observations = (*(self._set_up(group)[1]), axis)
         predictor = eqx.tree_at(lambda p: p.observations, problem.predictor, observations[-1:])
         b, A = self._affine(rows, group)
-        found, slopes, status = linearised(
-            predictor, b + A @ self.x, rows, (axis.value,), len(rows)
-        )
-        del status
-        slopes = np.einsum("srl,slk->srk", slopes, A)
+        found = linearised(predictor, b + A @ self.x, rows, (axis.value,), chunk=len(rows))
+        slopes = np.einsum("srl,slk->srk", found.slopes, A)
         free = np.isfinite(np.diag(self.covariance))
         variance = np.einsum(
             "srk,kl,srl->sr",
@@ -211,7 +209,7 @@ class Fit:
         )
         shape = axis.value.shape
         assert axis.X is not None
-        return Prediction(axis.X, found.reshape(shape), np.sqrt(variance).reshape(shape))
+        return Prediction(axis.X, found.residual.reshape(shape), np.sqrt(variance).reshape(shape))
 
     def refit(
         self,
@@ -241,7 +239,12 @@ class Fit:
             columns = [c for i, c in enumerate(columns) if i not in members[1:]]
             x = [value for i, value in enumerate(x) if i not in members[1:]]
         problem = replace(self.problem, columns=tuple(columns))
-        return Fit(problem, problem.adjust(np.clip(x, problem.box.low, problem.box.high)))
+        return Fit(
+            problem,
+            problem.adjust(
+                np.clip(x, problem.box.low, problem.box.high), guess=self.adjusted.outcome
+            ),
+        )
 
     def _affine(self, rows: Array, series: str) -> tuple[np.ndarray, np.ndarray]:
         problem = self.problem

@@ -1,8 +1,8 @@
 r"""How sure the unknowns of a fit are: covariance, and the combinations that data do not determine.
 
 With the residuals $f$ in standard deviations, $J = \partial f / \partial\theta$ and priors of
-standard deviations $s_k$, the covariance at a minimum is $(J^T J + S^{-2})^{-1}$. With a robust loss
-of influence $\psi$ it is $H^{-1} V H^{-1}$, $H = \overline{\psi'} J^T J + S^{-2}$, $V =
+standard deviations $s_k$, the covariance at a minimum is $(J^T J + S^{-2})^{-1}$. With a robust
+loss of influence $\psi$ it is $H^{-1} V H^{-1}$, $H = \overline{\psi'} J^T J + S^{-2}$, $V =
 \overline{\psi^2} J^T J + S^{-2}$.
 
 **Source:** Huber, Robust Statistics (1981), section 7.6.

@@ -1,5 +1,5 @@
-r"""The unknowns of a fit: their names, bounds and priors, and how the numbers of each shape depend on
-them.
+r"""The unknowns of a fit: their names, bounds and priors, and how the numbers of each shape depend
+on them.
 
 Every number that the model of shape s takes is affine in the unknowns, $p_s = b_s + A_s \theta$: a
 number of the scene is an unknown or several that share one; the base pose belongs to the series of
