@@ -161,7 +161,7 @@ class FitProblem:
             at, old, near, start = found.residuals.source, sd, found.residuals, found.x
             if known:
                 break
-            sd = self.unit_sd * self._factors(at, used, self._lost(found, box))
+            sd = self.unit_sd * self._factors(at, used, self.lost(found, box))
             if np.all(np.abs(sd / old - 1) < _SAME):
                 break
         scaled = self._scaled(at, sd, used)
@@ -191,7 +191,7 @@ class FitProblem:
                 factors[mine] = np.median(np.abs(f)) / _NORMAL_MEDIAN * np.sqrt(f.size / free)
         return np.where(factors > 0, factors, np.finfo(float).tiny ** 0.25)
 
-    def _lost(self, found: Minimum, box: Box) -> np.ndarray:
+    def lost(self, found: Minimum, box: Box) -> np.ndarray:
         """Degrees of freedom that each residual lost to the unknowns, summed over the shapes."""
         slopes, weights = found.residuals.slopes, found.weights
         A = normal_matrix(found.residuals, weights) + np.diag(box.sd**-2.0)

@@ -20,7 +20,7 @@ def _head(fit: Fit) -> list[str]:
         f"fit        {len(data)} shapes, {int(np.sum(data.present))} measured numbers, "
         f"{unknowns} unknowns",
         f"status     {fit.reason}, {fit.steps} steps; chi^2 {fit.chi_squared:.4g} for "
-        f"{fit.freedom} degrees of freedom",
+        f"{fit.freedom:.4g} degrees of freedom",
     ]
 
 

@@ -15,13 +15,15 @@ from jaxtyping import Array, Float
 from ..arm.scene import Scene
 from ..arm.scene_numbers import matching
 from ..solution.equilibrium import Equilibrium
-from ..typing import ArrayLike, VectorLike
+from ..typing import ArrayLike, VectorLike, cast
 from ..validation import numbers
+from .measurements import Measurements
 from .observation import Markers
+from .plausible_data import check_positions
 from .predictions import linearised
 from .problem import Adjusted, FitProblem
 from .uncertainty import covariance_of, in_words, undetermined
-from .unknowns import affine
+from .unknowns import affine, for_series
 
 
 class Estimate(NamedTuple):
@@ -121,12 +123,12 @@ class Fit:
         r"""Sum of squares of the residuals in standard deviations, $\chi^2$."""
         return float(np.sum(self.adjusted.minimum.residuals.value**2))
 
-    @property
-    def freedom(self) -> int:
-        """Measured numbers that count, less the unknowns that are free without a prior."""
-        box = self.problem.box
-        free = np.sum((box.high > box.low) & ~np.isfinite(box.sd))
-        return int(np.sum(self.counted) - free)
+    @cached_property
+    def freedom(self) -> float:
+        """Degrees of freedom: measured numbers that count, less those that the unknowns take up. A
+        free unknown takes up one, with a prior that says more than the data less."""
+        lost = self.problem.lost(self.adjusted.minimum, self.problem.box)
+        return float(np.sum(self.counted) - np.sum(lost))
 
     @property
     def reduced_chi_squared(self) -> float:
@@ -228,7 +230,7 @@ class Fit:
         for pattern, value in (fixed or {}).items():
             for label in matching(pattern, dict.fromkeys(column.label for column in columns)):
                 i = [column.label for column in columns].index(label)
-                columns[i] = columns[i]._replace(low=value, high=value, start=value)
+                columns[i] = columns[i].fixed(value)
                 x[i] = value
         for pattern in shared:
             labels = matching(pattern, dict.fromkeys(column.label for column in columns))
@@ -245,6 +247,28 @@ class Fit:
                 np.clip(x, problem.box.low, problem.box.high), guess=self.adjusted.outcome
             ),
         )
+
+    def on(self, data: Measurements) -> "Fit":
+        """The fit tested on other measurements: base poses of their series are fitted, unless all
+        series share them, and nothing else. By the same compiled program for as many shapes.
+
+        **Arguments:** `data`: the same kinds of observations.
+
+        **Raises:** `ValueError` for other kinds, inputs out of range, and markers that the arm
+        cannot reach.
+        """
+        names, own = (
+            tuple(one.name for one in some.observations) for some in (data, self.problem.data)
+        )
+        if names != own:
+            raise ValueError(f"data: got {', '.join(names)}, need {', '.join(own)}, as the fit")
+        columns = for_series(self.problem.columns, self.x, data.groups)
+        check_positions(self.problem.predictor.scene, data, columns)
+        for row in data.inputs:
+            self.problem.predictor.scene.check_inputs(row)
+        data = cast(data, self.problem.data.inputs.dtype)
+        problem = replace(self.problem, columns=columns, data=data)
+        return Fit(problem, problem.adjust(problem.start))
 
     def _affine(self, rows: Array, series: str) -> tuple[np.ndarray, np.ndarray]:
         problem = self.problem

@@ -59,7 +59,7 @@ class _Target(NamedTuple):
 
 class Column(NamedTuple):
     """One unknown: its label and unit, its value at the start, bounds and prior (infinite standard
-    deviation for none), and what it acts on."""
+    deviation for none), what it acts on, and whether it is `shared` by all names that match."""
 
     label: str
     unit: str
@@ -69,6 +69,11 @@ class Column(NamedTuple):
     mean: float
     sd: float
     acts: tuple[tuple[Slot, str, str], ...]
+    shared: bool = False
+
+    def fixed(self, value: float) -> "Column":
+        """The unknown fixed at a value."""
+        return self._replace(low=value, high=value, start=value)
 
 
 def columns_of(scene: Scene, data: Measurements, free: Free) -> tuple[Column, ...]:
@@ -168,7 +173,30 @@ def _entries(label: str, unknown: Unknown, members: list[_Target]) -> Iterator[C
             float(np.clip(start[place], low[place], high[place])),
             *(float(x[place]) for x in (low, high, mean, sd)),
             tuple(((one.slots, i), one.acts, one.series) for one in members),
+            unknown.shared,
         )
+
+
+def for_series(
+    columns: Sequence[Column], x: np.ndarray, groups: Sequence[str]
+) -> tuple[Column, ...]:
+    """Unknowns for measurements of other series: base poses of their own, all else fixed at x. A
+    base pose that all series share is fixed too."""
+    found: dict[str, Column] = {}
+    for column, value in zip(columns, x.tolist(), strict=True):
+        if not any(kind == "series" for _, kind, _ in column.acts):
+            found[column.label] = column.fixed(value)
+            continue
+        slot = column.acts[0][0]
+        if column.shared:
+            acts = tuple((slot, "series", group) for group in groups)
+            found[column.label] = column.fixed(value)._replace(acts=acts)
+            continue
+        for group in groups:
+            name = f"{slot[0]}[{group}]" if group else slot[0]
+            own = column._replace(label=f"{name}[{slot[1]}]", acts=((slot, "series", group),))
+            found[own.label] = own._replace(start=float(np.clip(0.0, own.low, own.high)))
+    return tuple(found.values())
 
 
 def _limits(label: str, unknown: Unknown, shape: tuple[int, ...]) -> list[np.ndarray]:
