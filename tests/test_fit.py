@@ -384,7 +384,7 @@ def bad(free=FREE, value=None, scene=None, **options):
         (lambda: vsr.Markers(np.zeros((8, 3)), sd=0.0), "markers.sd"),
         (lambda: vsr.Markers(np.zeros((8, 2, 3))), "need an abscissa"),
         (lambda: vsr.Poses(np.zeros((8, 4, 4)), sd=1.0), "need both"),
-        (lambda: vsr.Measurements(INPUTS, vsr.Markers(INPUTS @ np.ones((2, 3))), series="AB"), "got 2"),
+        (lambda: vsr.Measurements(INPUTS, vsr.Tensions(INPUTS, [0, 1]), series="AB"), "got 2 n"),
     ],
 )  # fmt: skip
 def test_errors_are_one_line(problem, message, unchecked):

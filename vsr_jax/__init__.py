@@ -100,7 +100,7 @@ if TYPE_CHECKING:
     from .models.continuum import Continuum
     from .optimization.design_search import Design, design
     from .optimization.search import Search
-    from .viz import annotate, plot, plot_design
+    from .viz import annotate, plot, plot_design, plot_fit
     from .viz.animation import film
 
 __version__ = "0.1.0"
@@ -199,6 +199,7 @@ __all__ = [
     "plan",
     "plot",
     "plot_design",
+    "plot_fit",
     "reach",
     "save",
     "se3",
@@ -220,6 +221,7 @@ _LATER = {
     "film": "viz.animation",
     "plot": "viz.plot",
     "plot_design": "viz.plot_design",
+    "plot_fit": "viz.plot_fit",
 }
 """Modules of the names that only some programs need: diffrax, optax and matplotlib take longer to
 import than all the rest."""

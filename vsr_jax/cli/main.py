@@ -1,5 +1,5 @@
-"""The command `vsr-jax`: solves, checks, sweeps and designs scenes, finds inputs for targets,
-reproduces the paper, measures costs."""
+"""The command `vsr-jax`: solves, checks, sweeps, designs and calibrates scenes, finds inputs for
+targets, reproduces the paper, measures costs."""
 
 import argparse
 import sys
@@ -9,6 +9,7 @@ from .. import __version__
 from .common import BAD_USAGE, EXIT_CODES
 from .compiling import compiling
 from .design_commands import add_design
+from .fit_commands import add_fit
 from .inverse_commands import add_reach
 from .scene_commands import add_check, add_solve
 from .study_commands import add_accuracy, add_effects, add_paper
@@ -20,6 +21,7 @@ EXAMPLES = (
     "vsr-jax sweep scene.toml --samples 100000 --plot workspace.png",
     "vsr-jax reach scene.toml --target 0.5 0.1 0.2 --high 12",
     "vsr-jax design problem.toml --out designed.toml",
+    "vsr-jax fit fit.toml --out calibrated.toml",
     "vsr-jax paper --out results",
     "vsr-jax effects",
     "vsr-jax accuracy scene.toml",
@@ -69,6 +71,7 @@ def _parser() -> argparse.ArgumentParser:
     add_sweep(commands)
     add_reach(commands)
     add_design(commands)
+    add_fit(commands)
     add_paper(commands)
     add_effects(commands)
     add_accuracy(commands)
