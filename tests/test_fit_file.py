@@ -12,7 +12,10 @@ from vsr_jax.calibration.fit_file import load_fit
 from vsr_jax.cli import main as cli
 
 SCENE = """
-actuators = [{ type = "Tendon", routing = { type = "Linear", y = 0.006, z = 0.0, slope_y = -0.01 } }]
+[[actuators]]
+type = "Tendon"
+routing = { type = "Linear", y = 0.006, z = 0.0, slope_y = -0.01 }
+
 [rod]
 length = 0.2
 section = { type = "Circular", radius = 0.008 }
