@@ -1,19 +1,19 @@
 """A fit in words: a table of its numbers, residuals, and what the data do not determine."""
 
-import numpy as np
+from typing import Any
 
-from .result import Fit
+import numpy as np
 
 _LARGE = 2.0
 """Reduced chi squared above which the residuals are larger than the standard deviations say."""
 
 
-def report(fit: Fit) -> str:
-    """The report that `print` shows."""
+def report(fit: Any) -> str:
+    """The report that `print` of a `Fit` shows."""
     return "\n".join([*_head(fit), *_numbers(fit), *_residuals(fit), *_warnings(fit)])
 
 
-def _head(fit: Fit) -> list[str]:
+def _head(fit: Any) -> list[str]:
     data = fit.problem.data
     unknowns = sum(column.high > column.low for column in fit.problem.columns)
     return [
@@ -24,7 +24,7 @@ def _head(fit: Fit) -> list[str]:
     ]
 
 
-def _numbers(fit: Fit) -> list[str]:
+def _numbers(fit: Any) -> list[str]:
     width = max(map(len, fit.names))
     lines = []
     for name, one in fit.numbers.items():
@@ -34,7 +34,7 @@ def _numbers(fit: Fit) -> list[str]:
     return lines
 
 
-def _residuals(fit: Fit) -> list[str]:
+def _residuals(fit: Any) -> list[str]:
     units = {
         label: unit
         for one in fit.problem.data.observations
@@ -52,7 +52,7 @@ def _residuals(fit: Fit) -> list[str]:
     return lines
 
 
-def _warnings(fit: Fit) -> list[str]:
+def _warnings(fit: Any) -> list[str]:
     lines = [f"NOT DETERMINED: {sentence}" for sentence in fit.undetermined]
     if fit.failed:
         shapes = ", ".join(map(str, fit.failed))

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,13 +14,15 @@ from jaxtyping import Array, Float
 from ..arm.scene import Scene
 from ..arm.scene_numbers import matching
 from ..solution.equilibrium import Equilibrium
+from ..solution.solver import solve
 from ..typing import ArrayLike, VectorLike, cast
 from ..validation import numbers
 from .measurements import Measurements
 from .observation import Markers
 from .plausible_data import check_positions
-from .predictions import linearised
+from .predictions import Predictor, linearised
 from .problem import Adjusted, FitProblem
+from .report import report
 from .uncertainty import covariance_of, in_words, undetermined
 from .unknowns import affine, for_series
 
@@ -174,8 +175,6 @@ class Fit:
 
     def solve(self, recorded: VectorLike, series: str | None = None) -> Equilibrium:
         """The equilibrium of the calibrated scene for recorded inputs."""
-        from ..solution.solver import solve
-
         group = self.problem.data.groups[0] if series is None else series
         return solve(
             self.scene_of(group), self.inputs(recorded), model=self.problem.predictor.model
@@ -195,10 +194,11 @@ class Fit:
         rows = numbers("recorded", recorded, None).astype(problem.data.inputs.dtype)
         scene = problem.predictor.scene
         stations = jnp.linspace(0, scene.rod.length, X) if isinstance(X, int) else X
-        axis = Markers(jnp.zeros((len(rows), np.size(stations), 3), rows.dtype), stations)
+        places = jnp.zeros((len(rows), np.size(stations), 3), rows.dtype)
+        axis = Markers(places, stations, name="axis")
         axis.check(scene.rod)
-        observations = (*(self._set_up(group)[1]), axis)
-        predictor = eqx.tree_at(lambda p: p.observations, problem.predictor, observations[-1:])
+        model, slots = problem.predictor.model, problem.predictor.slots
+        predictor = Predictor.of(scene, model, (axis,), slots)
         b, A = self._affine(rows, group)
         found = linearised(predictor, b + A @ self.x, rows, (axis.value,), chunk=len(rows))
         slopes = np.einsum("srl,slk->srk", found.slopes, A)
@@ -282,8 +282,6 @@ class Fit:
         return self.problem.predictor.set_up(local)
 
     def __str__(self) -> str:
-        from .report import report
-
         return report(self)
 
     __repr__ = __str__
