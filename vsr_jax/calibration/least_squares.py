@@ -101,8 +101,8 @@ def minimise(
     one; `near`: those for the start; `report`: called with the number of steps and the cost.
     """
     here, damping, scale = evaluate(start, near), _FIRST_DAMPING, np.zeros(start.size)
-    x = start
-    for step in range(steps + 1):
+    x, step = start, 0
+    while True:
         weights, cost = loss_of(loss, here.value)[1], _cost(here, here.solved, x, box, loss)
         if step:
             report(step, cost)
@@ -111,7 +111,7 @@ def minimise(
         if gain <= _LEAST_GAIN:
             return Minimum(x, here, weights, cost, step, True, "converged")
         if step == steps:
-            break
+            return Minimum(x, here, weights, cost, steps, False, f"stopped after {steps} steps")
         scale = np.maximum(scale, np.diag(A))
         size = np.where(scale > 0, scale, 1.0)
         found = _descend(evaluate, x, here, (A, slope, fixed), size, damping, box, loss)
@@ -120,7 +120,7 @@ def minimise(
             reason = "converged to rounding" if done else "no step lowers the cost"
             return Minimum(x, here, weights, cost, step, done, reason)
         x, here, damping = found
-    return Minimum(x, here, weights, cost, steps, False, f"stopped after {steps} steps")
+        step += 1
 
 
 def _quadratic(
@@ -160,7 +160,7 @@ def _descend(
         new = _cost(there, here.solved, trial, box, loss)
         ratio = (old - new) / foreseen if np.all(there.solved | ~here.solved) else -1.0
         if ratio > _LEAST_RATIO:
-            return trial, there, damping * max(1 / 3, 1 - (2 * ratio - 1) ** 3)
+            return trial, there, damping * max(1 / 3, float(1 - (2 * ratio - 1) ** 3))
         damping, growth = damping * growth, growth * 2
     return None
 

@@ -147,23 +147,16 @@ class FitProblem:
             at = first if near is None else self.at(x, near.source.outcome)
             return self._scaled(at, sd, used)
 
-        near = None
-        for _ in range(_ROUNDS):
-            found = minimise(
-                partial(evaluate, sd=sd),
-                start,
-                box,
-                loss=self.loss,
-                steps=self.steps,
-                near=near,
-                report=report,
-            )
-            at, old, near, start = found.residuals.source, sd, found.residuals, found.x
-            if known:
-                break
+        minimum = partial(minimise, box=box, loss=self.loss, steps=self.steps, report=report)
+        found = minimum(partial(evaluate, sd=sd), start)
+        at = found.residuals.source
+        for _ in range(0 if known else _ROUNDS):
+            old = sd
             sd = self.unit_sd * self._factors(at, used, self.lost(found, box))
             if np.all(np.abs(sd / old - 1) < _SAME):
                 break
+            found = minimum(partial(evaluate, sd=sd), found.x, near=found.residuals)
+            at = found.residuals.source
         scaled = self._scaled(at, sd, used)
         found = found._replace(residuals=scaled, weights=loss_of(self.loss, scaled.value)[1])
         return Adjusted(found.x, sd, found, at.outcome)

@@ -193,8 +193,11 @@ class Fit:
         problem, group = self.problem, self.problem.data.groups[0] if series is None else series
         rows = numbers("recorded", recorded, None).astype(problem.data.inputs.dtype)
         scene = problem.predictor.scene
-        stations = jnp.linspace(0, scene.rod.length, X) if isinstance(X, int) else X
-        places = jnp.zeros((len(rows), np.size(stations), 3), rows.dtype)
+        length = scene.rod.length
+        stations = (
+            jnp.linspace(0, length, X) if isinstance(X, int) else jnp.atleast_1d(jnp.array(X))
+        )
+        places = jnp.zeros((len(rows), stations.size, 3), rows.dtype)
         axis = Markers(places, stations, name="axis")
         axis.check(scene.rod)
         model, slots = problem.predictor.model, problem.predictor.slots

@@ -171,7 +171,10 @@ def _entries(label: str, unknown: Unknown, members: list[_Target]) -> Iterator[C
             label + "".join(f"[{k}]" for k in place),
             first.units[i],
             float(np.clip(start[place], low[place], high[place])),
-            *(float(x[place]) for x in (low, high, mean, sd)),
+            float(low[place]),
+            float(high[place]),
+            float(mean[place]),
+            float(sd[place]),
             tuple(((one.slots, i), one.acts, one.series) for one in members),
             unknown.shared,
         )

@@ -4,7 +4,7 @@ import jax
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, FigureBase
 
 from ..calibration.observation import Markers
 from ..calibration.result import Fit
@@ -77,7 +77,9 @@ def residuals(fit: Fit, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def corner(fit: Fit, figure: Figure | None = None, *, names: list[str] | None = None) -> Figure:
+def corner(
+    fit: Fit, figure: FigureBase | None = None, *, names: list[str] | None = None
+) -> FigureBase:
     """Unknowns in pairs: the ellipse of 95 % of their normal distribution; on the diagonal their
     densities.
 
@@ -119,10 +121,11 @@ def corner(fit: Fit, figure: Figure | None = None, *, names: list[str] | None = 
 def overview(fit: Fit) -> Figure:
     """Shapes in two planes, residuals, and the unknowns in pairs, in one figure."""
     figure = plt.figure(figsize=(13, 8), layout="constrained")
-    left, right = figure.subfigures(1, 2)
-    top, bottom = left.subfigures(2, 1)
-    for ax, axes in zip(top.subplots(1, 2), ("xz", "yz"), strict=True):
+    sides = figure.subfigures(1, 2, squeeze=False)
+    left = sides[0, 0].subplots(2, 2)
+    for ax, axes in zip(left[0], ("xz", "yz"), strict=True):
         shapes(fit, ax, axes=axes)
-    residuals(fit, bottom.subplots())
-    corner(fit, right)
+    left[1, 1].set_axis_off()
+    residuals(fit, left[1, 0])
+    corner(fit, sides[0, 1])
     return figure
