@@ -113,6 +113,8 @@ class FitProblem:
         found = linearised(self.predictor, b + A @ x, inputs, values, guess=guess, chunk=chunk)
         slopes = np.einsum("srl,slk->srk", found.slopes, A)
         solved = np.asarray(found.outcome.status) == Status.CONVERGED
+        # at a singular tangent an equilibrium has no derivatives
+        solved &= np.all(np.isfinite(slopes), axis=(1, 2))
         return Evaluation(found.residual, slopes, solved, found.outcome)
 
     def at(self, x: np.ndarray, guess: Outcome | None = None) -> Evaluation:
