@@ -21,6 +21,7 @@ PACKAGES = (
     "fabrication",
     "analysis",
     "optimization",
+    "calibration",
     "viz",
     "studies",
     "cli",

@@ -60,6 +60,25 @@ if TYPE_CHECKING:
         parameters,
         pose,
     )
+    from .calibration import (
+        Comparison,
+        CrossValidation,
+        Curvatures,
+        Fit,
+        LikelihoodProfile,
+        Markers,
+        Measurements,
+        NextMeasurement,
+        Observation,
+        Poses,
+        Tensions,
+        Unknown,
+        compare,
+        cross_validate,
+        fit,
+        likelihood_profile,
+        next_measurement,
+    )
     from .fabrication import Fabrication, export
     from .files import SceneFile, load, save
     from .models import (
@@ -83,7 +102,7 @@ if TYPE_CHECKING:
     from .optimization.design_search import Design, design
     from .optimization.search import Search
     from .solution import Energy, Equilibrium, Error, Plan, SolveError, Summary, plan, solve
-    from .viz import annotate, plot, plot_design
+    from .viz import annotate, plot, plot_design, plot_fit
     from .viz.animation import film
 
 __version__ = "0.1.0"
@@ -94,8 +113,11 @@ __all__ = [
     "Branch",
     "Chamber",
     "Circular",
+    "Comparison",
     "Constant",
     "Continuum",
+    "CrossValidation",
+    "Curvatures",
     "Design",
     "DistributedWrench",
     "Ellipsoid",
@@ -104,6 +126,7 @@ __all__ = [
     "Equilibrium",
     "Error",
     "Fabrication",
+    "Fit",
     "Function",
     "FunctionBasis",
     "FunctionProfile",
@@ -113,11 +136,16 @@ __all__ = [
     "Helix",
     "Joined",
     "Legendre",
+    "LikelihoodProfile",
     "Linear",
     "MagneticDensity",
     "MagneticMoment",
+    "Markers",
     "Material",
+    "Measurements",
     "Monomial",
+    "NextMeasurement",
+    "Observation",
     "Parallel",
     "Parameter",
     "Payload",
@@ -127,6 +155,7 @@ __all__ = [
     "PointWrench",
     "Polynomial",
     "PolynomialProfile",
+    "Poses",
     "Prescribed",
     "Reach",
     "Rectangular",
@@ -146,28 +175,36 @@ __all__ = [
     "Sweep",
     "Taper",
     "Tendon",
+    "Tensions",
     "Thread",
     "TipWrench",
     "Trigonometric",
+    "Unknown",
     "actuation_matrix",
     "annotate",
     "check",
+    "compare",
     "compliance",
     "compliance_ellipsoid",
     "constraint",
+    "cross_validate",
     "design",
     "export",
     "film",
+    "fit",
     "follow",
     "follow_branch",
     "jacobian",
+    "likelihood_profile",
     "load",
     "manipulability",
+    "next_measurement",
     "objective",
     "parameters",
     "plan",
     "plot",
     "plot_design",
+    "plot_fit",
     "pose",
     "reach",
     "save",
@@ -181,7 +218,16 @@ __all__ = [
     "zanna_step",
 ]
 
-_PACKAGES = ("analysis", "arm", "files", "models", "numerics", "optimization", "solution")
+_PACKAGES = (
+    "analysis",
+    "arm",
+    "calibration",
+    "files",
+    "models",
+    "numerics",
+    "optimization",
+    "solution",
+)
 """Packages whose names the face shows, imported together when one of them is first used: importing
 JAX takes half a second, which the help of the command and shells that complete names do not need.
 """
@@ -197,6 +243,7 @@ _LATER = {
     "film": "viz.animation",
     "plot": "viz.plot",
     "plot_design": "viz.plot_design",
+    "plot_fit": "viz.plot_fit",
 }
 """Modules of the names that only some programs need: diffrax, optax and matplotlib take longer to
 import than all the rest."""

@@ -1,4 +1,4 @@
-"""The numbers of a scene by name, with their units. Sensitivities and designs use these names.
+"""The numbers of a scene by name, with their units: names for sensitivities, designs and fits.
 
 Names consist of constructor arguments, as in a scene file: `rod.section.radius.base`,
 `actuators[0].routing.angle`, `loads[1].force`. A profile that is a plain number has the name of the
@@ -23,9 +23,8 @@ from ..validation import numbers
 from .description import Part
 from .fields import Unit, coefficient_unit, item_unit, unit_of
 
-AnyPart = TypeVar("AnyPart", bound=Part)
-
 Way = tuple[Callable[[Any], Any], ...]
+Module = TypeVar("Module", bound=eqx.Module)
 
 
 class Parameter(NamedTuple):
@@ -51,8 +50,9 @@ class Parameter(NamedTuple):
         ]
 
 
-def parameters(scene: Part) -> dict[str, Parameter]:
-    """Every number of a scene by its name: its `value`, and its `unit` if known."""
+def parameters(scene: eqx.Module) -> dict[str, Parameter]:
+    """Every number of a scene, or of another module, by its name: its `value`, and its `unit` if
+    known."""
     return dict(_walk(scene, "", "", False, ()))
 
 
@@ -61,7 +61,7 @@ def matching(pattern: str, known: Mapping[str, object]) -> list[str]:
 
     **Raises:** `ValueError` if no name matches.
     """
-    form = re.compile(re.escape(pattern).replace(r"\[\*\]", r"\[\d+\]"))
+    form = re.compile(re.escape(pattern).replace(r"\[\*\]", r"\[[^]]+\]"))
     names = [name for name in known if form.fullmatch(name)]
     if not names:
         close = difflib.get_close_matches(pattern, known, n=1)
@@ -88,14 +88,14 @@ def checked_values(scene: Part, values: Mapping[str, ArrayLike | VectorLike]) ->
     return found
 
 
-def replaced(scene: AnyPart, values: Mapping[str, Array]) -> AnyPart:
-    """The scene with new values of the named numbers."""
-    known = parameters(scene)
+def replaced(part: Module, values: Mapping[str, Array]) -> Module:
+    """A scene, or another module, with new values of the named numbers."""
+    known = parameters(part)
     ways = [known[name].way for name in values]
     return (
-        eqx.tree_at(lambda s: [_at(s, way) for way in ways], scene, list(values.values()))
+        eqx.tree_at(lambda s: [_at(s, way) for way in ways], part, list(values.values()))
         if ways
-        else scene
+        else part
     )
 
 

@@ -1,5 +1,5 @@
-"""The command `vsr-jax`: solves, checks, sweeps and designs scenes, finds inputs for targets,
-reproduces the paper, measures costs."""
+"""The command `vsr-jax`: solves, checks, sweeps, designs and calibrates scenes, finds inputs for
+targets, reproduces the paper, measures costs."""
 
 import argparse
 import sys
@@ -45,6 +45,11 @@ COMMANDS = {
         "design_commands",
         "find routings, sizes and inputs by gradient descent",
         "vsr-jax design problem.toml --out designed.toml",
+    ),
+    "fit": Command(
+        "fit_commands",
+        "calibrate a scene with measured shapes",
+        "vsr-jax fit fit.toml --out calibrated.toml",
     ),
     "export": Command(
         "fabrication_commands",

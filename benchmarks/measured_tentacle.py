@@ -1,0 +1,246 @@
+"""A silicone tentacle that somebody measured (`benchmarks/measured/tentacle`): calibrate on the
+eight holds of series A, test on the eight of series B, compare models.
+
+    pip install . && python benchmarks/measured_tentacle.py [--json FILE] [--plot PNG] [--free N]
+
+For each model: root mean square distance of the four markers on A, which is fitted, and on B, of
+which only the position of the base is fitted. `--free N` also runs Nelder-Mead and Powell with at
+most N solves of the whole series.
+"""
+
+import argparse
+import csv
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+from scipy import optimize
+
+import vsr_jax as vsr
+from vsr_jax.calibration.unknowns import affine
+from vsr_jax.studies.timing import machine
+
+FOLDER = Path(__file__).parent
+MODEL = vsr.StrainDependent(12)
+STEPS = 25
+LINK_1, LENGTH = 0.305, 0.360
+X = [0.1291, 0.2195, 0.2800, 0.3600]
+OFFSETS = np.array([[0, 0, 0.025], [0, 0, -0.021], [0, 0, 0.020], [0.008, 0, 0]])
+MISFIT = np.array([4.0, 7.0, 4.0, 8.0])[:, None] * 1e-3 / np.sqrt(3)
+"""What the model is expected to miss of each coordinate [m]; a marker is known to 0.2 mm."""
+MODULI = "rod.material.young.values[*]"
+PATH = "actuators[*].routing.function.parameters"
+ANGLES = [f"actuators[{i}].routing.function.parameters[2]" for i in (0, 1)]
+
+
+def path(X: jax.Array, offset: jax.Array, slope: jax.Array, angle: jax.Array) -> tuple:
+    """A tendon at an angle that comes closer to the axis along link 1 and is parallel to it
+    beyond."""
+    distance = offset + slope * jnp.minimum(X, LINK_1)
+    return distance * jnp.cos(angle), distance * jnp.sin(angle)
+
+
+def link_1(X: jax.Array) -> jax.Array:
+    return 0.01541 + (0.00642 - 0.01541) * X / LINK_1
+
+
+def link_2(X: jax.Array) -> jax.Array:
+    return 0.00642 + (0.00480 - 0.00642) * (X - LINK_1) / (LENGTH - LINK_1)
+
+
+def tentacle() -> vsr.Scene:
+    """The arm as its makers state it, with some friction and a stiff link 2, so that all holds have
+    an equilibrium at the start."""
+    hanging = np.array([[0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1.0]])
+    rod = vsr.Rod(
+        LENGTH,
+        vsr.Circular(vsr.Piecewise([LINK_1], [link_1, link_2])),
+        vsr.Material(vsr.Piecewise([LINK_1], [3e5, 2.5e6]), poisson=0.45, density=1500.0),
+        base=hanging,
+        guide_radius=0.0125,
+    )
+    tendons = [
+        vsr.Tendon(
+            vsr.Function(path, 0.0114, -0.0295, np.deg2rad(angle)), friction=0.15, end=LENGTH
+        )
+        for angle in (30, 150)
+    ]
+    return vsr.Scene(rod, tendons, [vsr.Gravity()])
+
+
+def unknowns(*, moduli: int = 2) -> dict[str, vsr.Unknown]:
+    def near(value: float, sd: float, **options: Any) -> vsr.Unknown:
+        return vsr.Unknown(value - 4 * sd, value + 4 * sd, prior=(value, sd), **options)
+
+    return {
+        MODULI: vsr.Unknown(5e4, 5e6, shared=moduli == 1),
+        "rod.material.density": near(1500.0, 150.0),
+        "actuators[*].friction": vsr.Unknown(0.0, 0.6),
+        "actuators[*].end": vsr.Unknown(LENGTH, LENGTH, shared=True),
+        "inputs.gain": near(1.0, 0.1),
+        "base.position[*]": near(0.0, 0.01),
+        "base.rotation[*]": near(0.0, 0.05, shared=True),
+        f"{PATH}[0]": near(0.0114, 0.0005, shared=True),
+        f"{PATH}[1]": near(-0.0295, 0.002, shared=True),
+        ANGLES[0]: near(np.deg2rad(30), 0.05),
+        ANGLES[1]: near(np.deg2rad(150), 0.05),
+    }
+
+
+STATED = {f"{PATH}[0]": 0.0114, f"{PATH}[1]": -0.0295} | dict(
+    zip(ANGLES, np.deg2rad([30, 150]).tolist(), strict=True)
+)
+MODELS: dict[str, tuple[int, dict[str, float]]] = {
+    "calibrated": (2, {}),
+    "without friction": (2, {"actuators[*].friction": 0.0}),
+    "one modulus, tendons end at 314 mm": (1, {"actuators[*].end": 0.314}),
+    "gains of one": (2, {"inputs.gain": 1.0}),
+    "base not turned": (2, {"base.rotation[*]": 0.0}),
+    "tendon paths as stated": (2, STATED),
+    "one modulus": (1, {}),
+}
+"""Number of moduli of each model, and what is fixed in it."""
+
+
+def holds(series: str) -> vsr.Measurements:
+    with (FOLDER / "measured/tentacle/holds.csv").open(encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if row["series"] == series]
+    inputs = [[float(row[f"tension{i}_N"]) for i in (1, 2)] for row in rows]
+    places = [
+        [[float(row[f"p{i}_{axis}_m"]) for axis in "xyz"] for i in range(1, 5)] for row in rows
+    ]
+    markers = vsr.Markers(
+        places, X, offset=OFFSETS, sd=MISFIT, labels=[f"p{i}" for i in range(1, 5)]
+    )
+    return vsr.Measurements(inputs, markers, series=[series] * len(rows))
+
+
+def millimetres(fit: vsr.Fit) -> list[float]:
+    return [round(1e3 * value, 2) for value in fit.rms().values()]
+
+
+def record_of(fit: vsr.Fit, test: vsr.Fit) -> dict[str, Any]:
+    return {
+        "rms on A [mm]": millimetres(fit),
+        "rms on B, held out [mm]": millimetres(test),
+        "held-out chi squared": test.chi_squared,
+        "status": fit.reason,
+        "failed": [list(fit.failed), list(test.failed)],
+        "undetermined": fit.undetermined,
+        "numbers": {
+            name: {"value": one.value, "error": one.error, "unit": one.unit}
+            for name, one in fit.numbers.items()
+            if not np.isnan(one.error) or one.at_bound
+        },
+    }
+
+
+def compared(
+    train: vsr.Measurements, test: vsr.Measurements, records: dict, write: Callable[[], None]
+) -> dict[str, vsr.Fit]:
+    """The fit of each model, all by one compiled program; their records are written one by one."""
+    fits = {}
+    for name, (moduli, fixed) in MODELS.items():
+        free = unknowns(moduli=moduli)
+        for label, value in fixed.items():
+            free = held(free, label, value)
+        start = time.perf_counter()
+        fit = vsr.fit(tentacle(), free, train, model=MODEL, steps=STEPS, progress=False)
+        seconds = time.perf_counter() - start
+        fits[name] = fit
+        records[name] = record_of(fit, fit.on(test)) | {"seconds": seconds, "steps": fit.steps}
+        a, b = (records[name][f"rms on {key} [mm]"] for key in ("A", "B, held out"))
+        lost = [len(one) for one in records[name]["failed"]]
+        print(f"{name:34} A {a} B {b} failed {lost} {fit.reason}, {seconds:.0f} s", flush=True)
+        write()
+    return fits
+
+
+def held(free: dict[str, vsr.Unknown], label: str, value: float) -> dict[str, vsr.Unknown]:
+    """The unknowns with one, or all that its name matches, fixed."""
+    name = label if label in free else label.rsplit("[", 1)[0]
+    return free | {name: free[name]._replace(low=value, high=value)}
+
+
+def gradient_free(fit: vsr.Fit, most: int) -> dict[str, Any]:
+    """Cost over that of the fit, minus one, that Nelder-Mead and Powell reach with a number of
+    solves of all shapes from the same start, and their time without compiling."""
+    problem, box = fit.problem, fit.problem.box
+    free = box.high > box.low
+    values = tuple(one.value for one in problem.data.observations)
+    guess = problem.predictor.unguessed(problem.data.inputs)
+    b, A = affine(
+        problem.columns,
+        problem.predictor.slots,
+        np.asarray(problem.data.inputs),
+        problem.data.series,
+    )
+    solved = eqx.filter_jit(jax.vmap(problem.predictor.residual))
+
+    def cost(share: np.ndarray) -> float:
+        x = fit.x.copy()
+        x[free] = box.low[free] + (box.high - box.low)[free] * np.clip(share, 0, 1)
+        residual, _ = solved(jnp.asarray(b + A @ x), problem.data.inputs, values, guess)
+        half = 0.5 * np.sum((np.asarray(residual) / fit.adjusted.sd) ** 2)
+        return float(np.where(np.isfinite(half), half, 1e9)) + box.prior_cost(x)
+
+    start = ((problem.start - box.low)[free] / (box.high - box.low)[free]).clip(0, 1)
+    cost(start)
+    found = {}
+    for method in ("Nelder-Mead", "Powell"):
+        began = time.perf_counter()
+        best = optimize.minimize(
+            cost, start, method=method, bounds=[(0, 1)] * start.size, options={"maxfev": most}
+        )
+        found[method] = {
+            "solves of all shapes": int(best.nfev),
+            "seconds": time.perf_counter() - began,
+            "cost over that of the fit - 1": best.fun / fit.adjusted.minimum.cost - 1,
+        }
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--free", type=int, default=0, metavar="N")
+    parser.add_argument("--json", metavar="FILE")
+    parser.add_argument("--plot", metavar="PNG")
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    train, test = holds("A"), holds("B")
+    record: dict[str, Any] = {"machine": machine(), "models": {}}
+
+    def write() -> None:
+        if options.json:
+            text = json.dumps(record, indent=1) + "\n"
+            Path(options.json).write_text(text, encoding="utf-8")
+
+    compared(train, test, record["models"], write)
+    start = time.perf_counter()
+    again = vsr.fit(tentacle(), unknowns(), train, model=MODEL, steps=STEPS, progress=False)
+    record["seconds without compiling"] = time.perf_counter() - start
+    print(again, flush=True)
+    write()
+    if options.free:
+        record["without gradients"] = gradient_free(again, options.free)
+        print(record["without gradients"])
+    if options.plot:
+        figure, axes = plt.subplots(1, 3, figsize=(13, 5), layout="constrained")
+        vsr.plot_fit.shapes(again, axes[0], axes="yz")
+        vsr.plot_fit.shapes(again.on(test), axes[1], axes="xz")
+        vsr.plot_fit.residuals(again, axes[2])
+        figure.savefig(options.plot, dpi=130)
+    write()
+
+
+if __name__ == "__main__":
+    main()
