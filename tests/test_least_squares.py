@@ -54,6 +54,23 @@ def test_bounds_hold_and_the_rest_is_optimal(system):
     np.testing.assert_allclose(covariance[:2, :2], np.linalg.inv(J[:, :2].T @ J[:, :2]))
 
 
+def test_large_residuals_take_few_steps():
+    """Brown and Dennis's problem, whose sum of squares is 85822.2 at the minimum: without an
+    estimate of the second-order term the steps are more than two hundred."""
+    t = np.arange(1, 21) / 5
+
+    def evaluate(x, near):
+        del near
+        a, b = x[0] + t * x[1] - np.exp(t), x[2] + x[3] * np.sin(t) - np.cos(t)
+        slopes = np.stack([2 * a, 2 * a * t, 2 * b, 2 * b * np.sin(t)], axis=-1)
+        return Residuals((a**2 + b**2)[None], slopes[None], np.array([True]))
+
+    found = minimise(evaluate, np.array([25.0, 5.0, -5.0, -1.0]), box(4))
+    assert found.converged
+    np.testing.assert_allclose(2 * found.cost, 85822.2016, rtol=1e-6)
+    assert found.steps <= 40
+
+
 def curve(t, y):
     """Residuals of a exp(-b t)."""
 

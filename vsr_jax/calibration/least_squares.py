@@ -3,13 +3,17 @@ r"""Damped Gauss-Newton steps within bounds, with priors and robust losses.
 $\min_\theta \frac12 \sum_i \rho(f_i(\theta)^2) + \frac12 \sum_k ((\theta_k - m_k) / s_k)^2, \quad
 l_k \le \theta_k \le h_k$
 
-Each step solves $(A + \lambda D) \delta = -g$ with $A = J^T W J + S^{-2}$, $W = \rho'(f^2)$ and D
-the diagonal of A. Components that are pushed against a bound stay there; the others continue along
-a bound that a step meets. The steps end where the undamped step would lower the cost by less than
-$10^{-6}$ of the variance of a residual: far less than the noise can tell.
+Each step solves $(A + C + \lambda D) \delta = -g$ with $A = J^T W J + S^{-2}$, $W = \rho'(f^2)$
+and D the diagonal of A. $C \approx \sum_i w_i f_i \nabla^2 f_i$, from the Jacobians of successive
+points by symmetric rank-one updates, matters in long valleys, where residuals stay large; it is
+used while it foresees the decrease of the cost better than $C = 0$. Components that are pushed
+against a bound stay there; the others continue along a bound that a step meets. The steps end where
+the undamped step would lower the cost by less than $10^{-6}$ of the variance of a residual: far
+less than the noise can tell.
 
 **Source:** Moré, The Levenberg-Marquardt algorithm (1978), for the scaling; Nielsen, Damping
-parameter in Marquardt's method (1999), for $\lambda$; James, Roos, MINUIT (1975), for the end.
+parameter in Marquardt's method (1999), for $\lambda$; Dennis, Gay, Welsch, An adaptive nonlinear
+least-squares algorithm (1981), for C; James, Roos, MINUIT (1975), for the end.
 """
 
 from collections.abc import Callable
@@ -26,6 +30,11 @@ _NOISE_GAIN = 1e-2
 _FIRST_DAMPING, _TRIALS, _LEAST_RATIO = 1e-3, 9, 1e-4
 """Damping of the first step; how often it is raised, by 2, 4, 8 ..., for one step; share of the
 foreseen decrease that a step has to bring."""
+
+
+_KNOWN = 1e-6
+"""Cosine of two directions above which an update of C is made; below, its denominator is nearly
+zero."""
 
 
 class Residuals(NamedTuple):
@@ -101,25 +110,33 @@ def minimise(
     one; `near`: those for the start; `report`: called with the number of steps and the cost.
     """
     here, damping, scale = evaluate(start, near), _FIRST_DAMPING, np.zeros(start.size)
+    curvature, curved = np.zeros((start.size, start.size)), False
     x, step = start, 0
     while True:
         weights, cost = loss_of(loss, here.value)[1], _cost(here, here.solved, x, box, loss)
         if step:
             report(step, cost)
         A, slope, fixed = _quadratic(here, weights, x, box)
-        gain = _expected(A, slope, fixed) / _variance(here.value, start.size)
+        H = A + curvature if curved and _convex(A + curvature, fixed) else A
+        gain = _expected(H, slope, fixed) / _variance(here.value, start.size)
         if gain <= _LEAST_GAIN:
             return Minimum(x, here, weights, cost, step, True, "converged")
         if step == steps:
             return Minimum(x, here, weights, cost, steps, False, f"stopped after {steps} steps")
         scale = np.maximum(scale, np.diag(A))
         size = np.where(scale > 0, scale, 1.0)
-        found = _descend(evaluate, x, here, (A, slope, fixed), size, damping, box, loss)
+        found = _descend(evaluate, x, here, (H, slope, fixed), size, damping, box, loss)
         if found is None:
             done = gain <= _NOISE_GAIN
             reason = "converged to rounding" if done else "no step lowers the cost"
             return Minimum(x, here, weights, cost, step, done, reason)
-        x, here, damping = found
+        ahead, there, damping = found
+        move = ahead - x
+        gained = cost - _cost(there, here.solved, ahead, box, loss)
+        foreseen = -(slope @ move) - 0.5 * move @ A @ move
+        curved = abs(foreseen - 0.5 * move @ curvature @ move - gained) < abs(foreseen - gained)
+        curvature = _updated(curvature, here, there, move, np.sqrt(size), loss)
+        x, here = ahead, there
         step += 1
 
 
@@ -133,6 +150,37 @@ def _quadratic(
     slope = slope + (x - box.mean) / box.sd**2
     pushed = ((x <= box.low) & (slope > 0)) | ((x >= box.high) & (slope < 0))
     return A, slope, pushed | (box.low == box.high)
+
+
+def _convex(H: np.ndarray, fixed: np.ndarray) -> bool:
+    """Whether the quadratic model has a minimum in the free unknowns."""
+    free = ~fixed
+    scale = np.sqrt(np.maximum(np.diag(H)[free], 0.0))
+    if not np.all(scale > 0):
+        return False
+    values = np.linalg.eigvalsh(H[np.ix_(free, free)] / np.outer(scale, scale))
+    return bool(np.all(values > np.finfo(float).eps * values.size))
+
+
+def _updated(
+    C: np.ndarray,
+    before: Residuals,
+    after: Residuals,
+    move: np.ndarray,
+    scale: np.ndarray,
+    loss: str,
+) -> np.ndarray:
+    """Rank-one update of C, so that it gives the change of the gradient beyond that of $J^T W J$;
+    C is first scaled down to the size of that change. `scale` makes the unknowns comparable."""
+    both = (before.solved & after.solved)[:, None]
+    pull = np.where(both, loss_of(loss, after.value)[1] * after.value, 0.0)
+    change = np.einsum("sr,srk->k", pull, after.slopes - before.slopes)
+    told, there = abs(move @ C @ move), abs(move @ change)
+    C = C * (there / told if told > there else 1.0)
+    short = change - C @ move
+    by = short @ move
+    known = abs(by) > _KNOWN * np.linalg.norm(short / scale) * np.linalg.norm(scale * move)
+    return C + np.outer(short, short) / by if known else C
 
 
 def _descend(
