@@ -248,7 +248,7 @@ def test_traced_points_beyond_the_arm_are_not_reached(scene):
 
 @pytest.mark.parametrize("close", [True, False])
 def test_the_command(tmp_path, capsys, monkeypatch, scene, close):
-    def reach(scene, target, bounds, model, allowed_miss):
+    def reach(scene, target, bounds, model, allowed_miss, progress):
         np.testing.assert_array_equal(target, [0.7, -0.1, 0.2])
         np.testing.assert_array_equal(bounds, [[0, 0, 0], [12, 12, 12]])
         assert allowed_miss == 1e-3

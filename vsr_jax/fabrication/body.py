@@ -83,7 +83,7 @@ def body_of(
     outer, *holes = _tubes(stations, _channels(scene, stations, bores, tolerance))
     steps = [
         step
-        for row in _jumps(stations.outline, stations)
+        for row in _jumps(stations.outline, stations).tolist()
         for step in _step(row, stations, outer, holes)
     ]
     last = stations.X.size - 1

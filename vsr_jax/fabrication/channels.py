@@ -73,7 +73,7 @@ def _ring(
         unit = tangent / jnp.linalg.norm(tangent, axis=-1, keepdims=True)
         return place + drift * delta[:, None], unit
 
-    def improved(_: int, delta: Array) -> Array:
+    def improved(_: Array | int, delta: Array) -> Array:
         return radius / t[0] * jnp.sum(direction * along(delta)[1][:, 1:], axis=-1)
 
     delta = jax.lax.fori_loop(0, _ITERATIONS, improved, jnp.zeros_like(angles))
