@@ -44,7 +44,7 @@ def _style(model: str, color: str) -> dict[str, Any]:
             "solid_capstyle": "butt",
         },
         "StrainDependent": {"color": color, "linestyle": "-", "linewidth": 1.5},
-        "Prescribed": {"color": shade(color), "linestyle": (0, (4, 3)), "linewidth": 1.5},
+        "Prescribed": {"color": shade(color), "linestyle": (0.0, (4.0, 3.0)), "linewidth": 1.5},
     }[model]
 
 
@@ -179,7 +179,7 @@ def figure_3(curves: Curves) -> Figure | None:
         "StrainDependent": ("strain-dependent, 1 DOF", _style("StrainDependent", COLORS[0])),
         "Prescribed": (
             "prescribed, 3 DOF",
-            {"color": COLORS[1], "linestyle": (0, (4, 3)), "linewidth": 2.0},
+            {"color": COLORS[1], "linestyle": (0.0, (4.0, 3.0)), "linewidth": 2.0},
         ),
         "PCS": (
             "PCS, three sections, 6 DOF",

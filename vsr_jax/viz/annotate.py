@@ -145,7 +145,7 @@ def _draw_arrows(ax: Axes3D, row: Row, arrows: np.ndarray, color: ColorType | No
     at_point = len(row.places) == 1
     color = (COLORS[3] if at_point else COLORS[4]) if color is None else color
     style: dict[str, Any] = {"color": color, "linewidth": 2.2 if at_point else 0.9}
-    dashes: dict[str, Any] = {"linestyle": (0, (2, 1))} if row.moment else {}
+    dashes: dict[str, Any] = {"linestyle": (0.0, (2.0, 1.0))} if row.moment else {}
     ax.quiver(*row.places.T, *arrows.T, arrow_length_ratio=0.25, **style, **dashes)
     if not at_point:
         ax.plot(*(row.places + arrows).T, **{**style, "linewidth": 0.6})

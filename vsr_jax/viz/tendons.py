@@ -19,7 +19,7 @@ from .style import RGB, TENSION
 _IDLE = 1e-9
 """Tension [N] below which a tendon counts as slack."""
 
-SLACK_DASHES = (0, (3, 2))
+SLACK_DASHES = (0.0, (3.0, 2.0))
 
 
 def is_slack(
