@@ -29,7 +29,7 @@ from vsr_jax.studies.timing import machine
 
 FOLDER = Path(__file__).parent
 MODEL = vsr.StrainDependent(12)
-STEPS = 25
+STEPS = 100
 LINK_1, LENGTH = 0.305, 0.360
 X = [0.1291, 0.2195, 0.2800, 0.3600]
 OFFSETS = np.array([[0, 0, 0.025], [0, 0, -0.021], [0, 0, 0.020], [0.008, 0, 0]])

@@ -145,6 +145,38 @@ class _Sizes(NamedTuple):
         return jnp.max(jnp.abs(x), axis=self._inner(x))
 
 
+def _followed(
+    step: ArmUnknown,
+    unknown: ArmUnknown,
+    imbalance: ArmImbalance,
+    problem: ArmProblem,
+    free: tuple[int, ...],
+) -> ArmUnknown:
+    r"""The step, with the unknowns of couplings that follow from the strain changed by its step
+    too: $\delta x = s - \partial s / \partial\xi \, \delta\xi$ for their rows s.
+
+    With $\delta x = s$ they would be one step late: twice as many steps, or none that converge."""
+    late = [i for i, one in enumerate(problem.couplings) if one.follows_rate]
+    if not late:
+        return step
+
+    def rows(xi: Vector) -> tuple:
+        at = state_of(xi, unknown.coupled, problem)
+        found = imbalance_of(ArmUnknown(xi, unknown.coupled), at, problem, free).coupled
+        return tuple(found[i] for i in late)
+
+    _, changes = jax.jvp(rows, (unknown.xi,), (cast(step.xi, problem.grid.h.dtype),))
+    coupled = list(step.coupled)
+    for i, change in zip(late, changes, strict=True):
+        coupled[i] = jax.tree.map(
+            lambda x, row, by: (row - by).astype(x.dtype),
+            coupled[i],
+            imbalance.coupled[i],
+            change,
+        )
+    return step._replace(coupled=tuple(coupled))
+
+
 def _solve(
     free: tuple[int, ...], origin: ArmUnknown, guess: ArmUnknown | None, whole: ArmProblem
 ) -> Root:
@@ -160,6 +192,7 @@ def _solve(
         at = state_of(unknown.xi, unknown.coupled, problem)
         imbalance = imbalance_of(unknown, at, problem, free)
         step, definite, doubtful = approximate_solve(unknown, at, imbalance, problem, free, damping)
+        step = _followed(step, unknown, imbalance, problem, free)
         size = sizes.of_step(step, at)
         # A step that coils the arm may lower the residual without approaching a solution.
         cut = jnp.minimum(1.0, MAX_TURN / jnp.maximum(sizes.turn(step), MAX_TURN))

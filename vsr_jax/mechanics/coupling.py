@@ -8,8 +8,8 @@ its part of the tangent system,
 $$\begin{pmatrix} A & P \\ F R & D \end{pmatrix}
 \begin{pmatrix} \delta\xi \\ \delta x \end{pmatrix} = \begin{pmatrix} r \\ s \end{pmatrix},$$
 
-a border of the system A of the strains. A coupling without a border has the tangent 1: Newton's
-method then repeats its rows from step to step.
+a border of the system A of the strains. A coupling without a border has $P = 0$ and $D = 1$ there;
+one that follows from the strain and its derivative is changed by the step of the strain too.
 
 To add one, derive from `Coupling` and name it in `couplings_of`. All arrays of one arm have the
 arms of a batch in further axes at their end.
