@@ -6,7 +6,7 @@ three arms.
 For each arm: the number of targets reached within 1 um, the largest miss, compile time and targets
 per second; and the same for targets beyond the arm's length, none of which may be reported as
 reached. Then a loaded arm follows a target that moves by 1 mm, a hundred times, from the result
-before and anew, in one program each.
+before and without it, in one program each.
 """
 
 import argparse
@@ -103,7 +103,7 @@ def follow(rounds: int) -> dict[str, Any]:
             "compile_s": job.compile_s,
             "ms per target": job.summary()["median_us"] / 1e3 / len(targets),
         }
-        for name, job in (("from the result before", warm), ("anew", cold))
+        for name, job in (("from the result before", warm), ("without it", cold))
     }
 
 

@@ -26,7 +26,7 @@ from ..arm.scene import Scene
 from ..models.base import Near, Outcome, Status
 from ..models.strain_dependent import StrainDependent
 from ..solution.equilibrium import Equilibrium
-from ..solution.solver import checked_outcome
+from ..solution.solver import checked_outcome, near_of
 from ..typing import cast
 from ..validation import instance, numbers
 
@@ -86,18 +86,10 @@ def _path(scene: Scene, inputs: ArrayLike | Sequence) -> Array:
 
 
 def _start(start: Equilibrium, scene: Scene, model: StrainDependent) -> Near:
-    instance("start", start, Equilibrium, "an Equilibrium, the result of another solve")
-    start.refuse_batch()
-    kinds = [
-        [type(actuator).__name__ for actuator in one.actuators] for one in (start.scene, scene)
-    ]
-    same = start.model == model and start.scene.frictional == scene.frictional
-    if not same or kinds[0] != kinds[1] or start.scene.length_driven != scene.length_driven:
-        raise ValueError(
-            f"start: got an equilibrium by {start.model} of a scene with other actuators or "
-            f"another model, need one of the same scene by {model}"
-        )
-    return Near(model, scene, start.sound_forces, start.state)
+    near = near_of(scene, start)
+    if near.model != model:
+        raise ValueError(f"start: got an equilibrium by {near.model}, need one by {model}")
+    return near._replace(scene=scene)
 
 
 @eqx.filter_jit

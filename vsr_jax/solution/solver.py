@@ -72,7 +72,7 @@ def solve(
     values = scene.check_inputs(inputs)
     chosen = _model(scene, values, model, tolerance)
     scene, chosen = cast((scene, chosen), values.dtype)
-    near = None if start is None else cast(_near(scene, start), values.dtype)
+    near = None if start is None else cast(near_of(scene, start), values.dtype)
     equilibrium = Equilibrium(scene, values, chosen, outcome_of(scene, values, chosen, near))
     return _raise_if_failed(equilibrium) if throw else equilibrium
 
@@ -93,7 +93,7 @@ def _model(scene: Scene, inputs: Array, model: Model | None, tolerance: float | 
     )
 
 
-def _near(scene: Scene, start: Equilibrium) -> Near:
+def near_of(scene: Scene, start: Equilibrium) -> Near:
     """What a solve needs of the equilibrium that it starts from."""
     instance("start", start, Equilibrium, "an Equilibrium, the result of another solve")
     start.refuse_batch()
