@@ -182,7 +182,9 @@ def eliminate(
     found = turned(transpose(nodes.rotation), found)
     if arms:
         found = found.reshape(6, *grid.X.shape[1::-1], *arms).swapaxes(1, 2)
-    return stacked.components(found), definiteness(negative + local, stable, asymmetry, grid)
+    # turning a strain into the world frame and back leaves rounding in those that are locked
+    strain = spread(free_components(stacked.components(found), free), free)
+    return strain, definiteness(negative + local, stable, asymmetry, grid)
 
 
 def _nodes(H: Matrix, right: Vector, along: Reaction, slopes: Slopes, grid: Grid) -> StepNodes:
