@@ -138,6 +138,13 @@ class _Sizes(NamedTuple):
         )
         return work.astype(self.problem.grid.h.dtype)
 
+    def dot(self, one: ArmUnknown, other: ArmUnknown) -> Array:
+        """Scalar product of two steps by their elastic energy, in single precision."""
+        stiffness, weight = self.problem.sections.stiffness, self.problem.grid.weight
+        terms = (s * x * y for s, x, y in zip(stiffness, one.xi, other.xi, strict=True))
+        total = jnp.sum(c.single(weight) * sum(c.single(tuple(terms))), axis=(0, 1))
+        return total.astype(self.problem.grid.h.dtype)
+
     def _inner(self, x: Array) -> tuple[int, ...]:
         return tuple(range(x.ndim - len(self.arms)))
 
@@ -203,4 +210,6 @@ def _solve(
     shares = 1 if whole.loads is None else LOAD_INCREMENTS
     floor = jnp.broadcast_to(rounding_of(whole), arms)
     again = None if guess is None else origin
-    return damped_newton(evaluate, Measures(sizes.work, sizes.turn), start, floor, shares, again)
+    return damped_newton(
+        evaluate, Measures(sizes.work, sizes.turn, sizes.dot), start, floor, shares, again
+    )

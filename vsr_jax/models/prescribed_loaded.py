@@ -281,11 +281,14 @@ def _solve(basis: NodalBasis, problem: ArmProblem) -> Root:
     def turn(step: GalerkinUnknown) -> Array:
         return sizes.turn(step.q)
 
+    def dot(one: GalerkinUnknown, other: GalerkinUnknown) -> Array:
+        return jnp.sum(elastic * one.q * other.q, axis=0)
+
     first = start(jnp.zeros((size, *arms), K.dtype), problem)
     first = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(x), *arms)), first)
     floor = jnp.broadcast_to(rounding_of(problem), arms)
     shares = 1 if problem.loads is None else LOAD_INCREMENTS
-    return damped_newton(evaluate, Measures(work, turn), first, floor, shares)
+    return damped_newton(evaluate, Measures(work, turn, dot), first, floor, shares)
 
 
 def _doubtful(J: Array, elastic: Array) -> Array:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from .acceleration import Earlier, accelerated
 from .component import select
 
 MAX_STEPS = 50
@@ -35,6 +36,9 @@ _RAISE, _LOWER = 10.0, 30.0
 _MIN_CONTRACTION, _MAX_CONTRACTION = 0.25, 0.99
 """Contraction of the residual above which a step is extrapolated, and the largest that is used: it
 bounds the extrapolation to 98 steps."""
+_TAIL, _QUADRATIC = 0.3, 0.3
+"""Angle [rad] of a step below which linear convergence is accelerated, and ratio of successive
+contractions below which convergence is quadratic."""
 _CERTAIN, _NEAR = 0.1, 1e-4
 """Contraction of steps and residuals, and size of a step, below which the last step is taken
 without an evaluation after it: what it leaves is then known from the contraction."""
@@ -136,10 +140,11 @@ class Damped(NamedTuple):
 
 class Measures(NamedTuple):
     """Measures of steps for `damped_newton`, with one entry per problem: `work`, the scalar product
-    of a residual and a step, and `turn`, a norm of a step."""
+    of a residual and a step; `turn`, a norm of a step; and `dot`, the scalar product of two."""
 
     work: Callable[[Any, Any], Array]
     turn: Callable[[Any], Array]
+    dot: Callable[[Any, Any], Array]
 
 
 class _Guard(NamedTuple):
@@ -162,6 +167,8 @@ class _Guard(NamedTuple):
     gradual: Array
     spent: Array
     plain: Array
+    whole: Array
+    contraction: Array
     doubtful: Array
     probes: Array
     growth: Array
@@ -191,6 +198,8 @@ def damped_newton(
     - Extrapolation. The tangent may be approximate. Where it is much too stiff for a soft motion of
       the arm, the residual along a full step contracts only by $\rho$ near 1. The next step then
       includes $\rho^2 / (1 - \rho)$ of the last one, the remainder of the geometric series.
+    - Acceleration. Near the solution, steps that shrink linearly, as with friction, and not
+      quadratically are replaced by those of `accelerated`.
     - Probing. Where the tangent is doubtful at the end, the arm is moved from the solution by the
       last step, made small, and creeps: $s_{n+1} = s_n + (H + \mu \Sigma)^{-1} r(x - s_n)$. The
       solution is unstable if the motion grows after some steps.
@@ -234,7 +243,7 @@ def damped_newton(
         return found & guard.doubtful & (guard.probes < _PROBES) & ~decayed
 
     def advance(state: tuple) -> tuple:
-        x, step, old = state
+        x, step, earlier, old = state
         probe = probing(old)
         step = _shrunk(step, probe, measures.turn)
         plain = (old.spent >= MAX_DAMPED_STEPS) | (old.damping >= _MAX_DAMPING) | (old.plain > 0)
@@ -248,6 +257,13 @@ def damped_newton(
         )
         more = jnp.where(probe, 1.0, more)
         new_step = jax.tree.map(lambda s, last: s + more.astype(s.dtype) * last, new.step, step)
+        linear = (
+            ~probe & (measures.turn(step) < _TAIL) & _linear(old, guard) & (new.merit > 4 * floor)
+        )
+        both = linear & (old.whole > 0)
+        near = accelerated(new.step, step, earlier, both, measures.dot)
+        new_step = select(linear, near, new_step)
+        earlier = select(taken, Earlier(new.step, step, earlier.proposed), earlier)
         pull = jnp.where(taken, measures.work(new.residual, new_step), guard.pull)
         go = going(old)
         ratio = measures.turn(new_step) / measures.turn(step)
@@ -257,12 +273,12 @@ def damped_newton(
         )
         x = select(go & taken, finished, x)
         if not twice:
-            return x, new_step, guard
+            return x, new_step, earlier, guard
         failed = jnp.where(go, ~(taken & new.definite), old.definite & ~guard.definite)
         again = ~old.gradual & failed
         guard = select(again, careful._replace(gradual=~careful.gradual, spent=guard.spent), guard)
         new_step = jax.tree.map(lambda s: jnp.where(again, 0.0, s).astype(s.dtype), new_step)
-        return select(again, origin, x), new_step, guard
+        return select(again, origin, x), new_step, earlier, guard
 
     careful = first = _careful(floor, increments)
     if twice:
@@ -272,8 +288,9 @@ def damped_newton(
         lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
         jax.eval_shape(evaluate, start, floor, floor).step,
     )
-    x, _, guard = lax.while_loop(
-        lambda state: jnp.any(going(state[2]) | probing(state[2])), advance, (start, step, first)
+    begin = (start, step, Earlier(step, step, step), first)
+    x, _, _, guard = lax.while_loop(
+        lambda state: jnp.any(going(state[3]) | probing(state[3])), advance, begin
     )
     return Root(x, guard.merit <= accepted, guard.definite, guard.spent)
 
@@ -296,6 +313,8 @@ def _careful(floor: Array, increments: int) -> _Guard:
         gradual=no,
         spent=none,
         plain=none,
+        whole=none,
+        contraction=zero + jnp.inf,
         doubtful=no,
         probes=none,
         growth=zero + 1,
@@ -381,6 +400,8 @@ def _judged(
         applied=applied,
         fresh=new.definite | plain,
         rises=old.rises + risen.astype(jnp.int32),
+        whole=jnp.where(whole, old.whole + 1, 0),
+        contraction=jnp.where(whole, ratio, jnp.inf),
         doubtful=new.doubtful,
     )
     here = old._replace(damping=damping, fresh=plain)
@@ -399,6 +420,12 @@ def _extrapolated(wanted: Array, left: Array) -> Array:
     along it."""
     rho = jnp.clip(left, 0.0, _MAX_CONTRACTION)
     return jnp.where(wanted & (rho > _MIN_CONTRACTION), rho**2 / (1 - rho), 0.0)
+
+
+def _linear(old: _Guard, guard: _Guard) -> Array:
+    """Whether steps shrink by nearly the same factor, and not by its square."""
+    there = guard.whole > old.whole
+    return there & (guard.contraction > _QUADRATIC * old.contraction)
 
 
 def _raised(damping: Array) -> Array:
