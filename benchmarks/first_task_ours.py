@@ -1,32 +1,45 @@
-"""The first task in vsr_jax, see `first_task.py`: a catheter, its picture, a gradient, a workspace.
+"""The first task in vsr_jax, see `first_task.py`. `# %%` starts a part."""
 
-Marks `# part` start a part: `first_task.py` counts the lines and the seconds of each.
-"""
-
-# part: import
-import sys
-
+# %% import
 import jax
-import jax.numpy as jnp
-import matplotlib
-from first_task import Parts
+import numpy as np
 
 import vsr_jax as vsr
 
-parts = Parts()
-matplotlib.use("Agg")
 jax.config.update("jax_enable_x64", True)
 
-# part: arm
+# %% arm
 wire = vsr.Rod(
     length=0.3,
-    section=vsr.Circular(0.0007),
+    section=vsr.Circular(radius=0.0007),
     material=vsr.Material(young=54e9, poisson=0.3, density=6450.0),
     guide_radius=0.0101,
 )
-tendons = [
-    vsr.Tendon(vsr.Parallel(y, z))
-    for y, z in ((0.0, 0.01), (0.00866, -0.005), (-0.00866, -0.005))
-]
+places = [(0.0, 0.010), (0.00866, -0.005), (-0.00866, -0.005)]
+tendons = [vsr.Tendon(vsr.Parallel(y, z)) for y, z in places]
 loads = [vsr.Gravity(), vsr.TipWrench(force=(0.0, 0.05, 0.0))]
 scene = vsr.Scene(wire, tendons, loads)
+model = vsr.StrainDependent(steps=6)
+
+# %% solve
+eq = vsr.solve(scene, [2.0, 0.0, 0.5], model=model)
+tip = eq.tip[:3, 3]
+print(eq)
+
+# %% picture
+vsr.plot.arm(eq).figure.savefig("arm.png")
+
+
+# %% gradient
+def height(scene):
+    return vsr.solve(scene, [2.0, 0.0, 0.5], model=model).tip[2, 3]
+
+
+slope = jax.grad(height)(scene).actuators[0].routing.z
+print(f"d tip_z / d distance of the first tendon: {slope:.4f}")
+
+# %% workspace
+tensions = np.random.default_rng(0).uniform(0.0, 4.0, (10_000, 3))
+result = vsr.sweep(scene, tensions, model=model)
+tips = result["tip"][:, :3, 3]
+print(result)
