@@ -3,8 +3,8 @@
     pip install -e ".[site]" && python docs/build.py [--execute] [--out build]
 
 Collects README.md, the pages of docs/, the notebooks and all files that they link to below
-build/pages; a link to a file that does not exist ends the build. Then zensical builds the site, with
-the docstrings by mkdocstrings. Formulas become MathML, which browsers draw without a script.
+build/pages; a link to a file that does not exist ends the build. Then zensical builds the site,
+with the docstrings by mkdocstrings. Formulas become MathML, which browsers draw without a script.
 Notebooks are stored without outputs; `--execute` runs them first, which takes minutes and needs the
 extra `notebooks`.
 """
@@ -62,7 +62,8 @@ class Pages:
         self.write(place(file), text.encode())
 
     def linked(self, page: Path, link: re.Match) -> str:
-        """A link of a page, as it is on the site; adds what it leads to."""
+        """A link of a page, as it is on the site; adds what it leads to. A figure `NAME_light.png`
+        stands beside `NAME_dark.png`, and the theme shows one of them."""
         before, target, after = link.groups()
         if target.startswith(("http://", "https://")):
             return link.group()
@@ -70,7 +71,11 @@ class Pages:
         if not file.is_file():
             sys.exit(f"{page.relative_to(ROOT)}: got a link to {target}, need a file")
         self.add(file)
-        return before + os.path.relpath(place(file), place(page).parent) + after
+        new = os.path.relpath(place(file), place(page).parent)
+        if not new.endswith("_light.png"):
+            return before + new + after
+        self.add(file.with_name(file.name.replace("_light", "_dark")))
+        return f"{before}{new}#only-light)![]({new.replace('_light', '_dark')}#only-dark)"
 
     def add_notebook(self, path: Path, execute: bool) -> None:
         """Adds a notebook as a page, with its figures beside it."""
@@ -116,13 +121,15 @@ def draw_formulas(site: Path) -> None:
     def mathml(found: re.Match) -> str:
         tex = html.unescape(found[2]).strip().removeprefix("\\(").removeprefix("\\[")
         tex = tex.removesuffix("\\)").removesuffix("\\]")
-        return convert(tex, display="inline" if found[1] == "span" else "block")
+        made = convert(tex, display="inline" if found[1] == "span" else "block")
+        return made.replace("<mi>&#x02032;</mi>", '<mo class="prime">&#x02032;</mo>')
 
     for page in site.rglob("*.html"):
         page.write_text(FORMULA.sub(mathml, page.read_text("utf-8")), encoding="utf-8")
 
 
 def main() -> None:
+    """Builds the site."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -130,6 +137,7 @@ def main() -> None:
     parser.add_argument("--out", metavar="FOLDER", type=Path, default=ROOT / "build")
     options = parser.parse_args()
     config = options.out / "zensical.toml"
+    shutil.rmtree(options.out / "site", ignore_errors=True)
     collect(options.out / "pages", options.execute)
     text = (DOCS / "zensical.toml").read_text(encoding="utf-8")
     config.write_text(text.replace("@ROOT@", ROOT.as_posix()), encoding="utf-8")

@@ -1,5 +1,5 @@
-"""The code blocks of the pages in docs/ run, and print what the pages say. Those of extending.md are
-in `test_contributing`, that of fabrication.md in `test_export`."""
+"""The code blocks of the pages in docs/ run, and print what the pages say. Those of extending.md
+are in `test_contributing`, that of fabrication.md in `test_export`."""
 
 import contextlib
 import io
