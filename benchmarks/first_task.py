@@ -5,7 +5,7 @@
 A catheter in gravity with a force on its tip: its shape, a picture, the derivative of the tip's
 height with respect to the distance of a tendon, and the tips for 10,000 random tensions. The
 programs are `first_task_ours.py` and `first_task_soromox.py`, written as a user would write them,
-at the coarsest settings whose tips are within a micrometre. `# %%` starts a part. Each program runs
+at settings whose tips are within a micrometre. `# %%` starts a part. Each program runs
 once in a new process, with nothing compiled before. PYTHON is an interpreter that has soromox and
 optimistix (`pip install ".[bench]"`).
 
@@ -123,11 +123,11 @@ def compared(run: dict[str, Any], program: str, truth: dict[str, Any]) -> dict[s
 def table(record: dict[str, Any]) -> str:
     """The table of docs/first_task.md."""
     runs = record["runs"]
-    rows = [f"| | {' | '.join(runs)} |", "| --- |" + " ---: |" * len(runs)]
+    rows = [f"| lines, seconds | {' | '.join(runs)} |", "| --- |" + " ---: |" * len(runs)]
     for part in PARTS:
-        cells = [f"{r['lines'][part]} lines, {r['seconds'][part]:.1f} s" for r in runs.values()]
+        cells = [f"{r['lines'][part]}, {r['seconds'][part]:.1f} s" for r in runs.values()]
         rows.append(f"| {part} | {' | '.join(cells)} |")
-    cells = [f"{sum(run['lines'].values())} lines, {run['total']:.0f} s" for run in runs.values()]
+    cells = [f"{sum(run['lines'].values())}, {run['total']:.0f} s" for run in runs.values()]
     rows.append(f"| **all**, from a cold start | {' | '.join(cells)} |")
     for name, key in (
         ("tip error", "tip error [m]"),
@@ -136,7 +136,8 @@ def table(record: dict[str, Any]) -> str:
         rows.append(f"| {name} | {' | '.join(f'{run[key]:.0e} m' for run in runs.values())} |")
     cells = [f"{run['gradient error']:.0e}" for run in runs.values()]
     rows.append(f"| relative error of the gradient | {' | '.join(cells)} |")
-    load = f"{record['load']:.1f} of {record['cores']} cores busy before the start"
+    load = " and ".join(f"{load:.1f}" for load in record["load"])
+    load = f"load average before and after: {load}"
     versions = ", ".join(f"{name} {version}" for name, version in record["versions"].items())
     return "\n".join([*rows, "", f"*{record['machine']}; {load}; {versions}.*", ""])
 
@@ -151,15 +152,16 @@ def main() -> None:
     if options.program:
         run_parts(options.program)
         return
-    load = os.getloadavg()[0]
+    load = [os.getloadavg()[0]]
     pythons = {"vsr_jax": sys.executable, "SoRoMoX": options.peers}
     runs = {tool: measure(pythons[tool], tool) for tool in PROGRAMS}
+    load.append(os.getloadavg()[0])
     truth = reference()
     runs = {tool: compared(run, PROGRAMS[tool], truth) for tool, run in runs.items()}
     from vsr_jax.studies.timing import machine
 
     versions = {name: v for run in runs.values() for name, v in run.pop("versions").items()}
-    record = {"machine": machine(), "cores": os.cpu_count(), "load": load, "versions": versions}
+    record = {"machine": machine(), "load": load, "versions": versions}
     record |= {"reference off Continuum [m]": truth["off"], "runs": runs}
     RECORD.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     text = PAGE.read_text(encoding="utf-8")

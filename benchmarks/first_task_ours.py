@@ -2,6 +2,7 @@
 
 # %% import
 import jax
+import matplotlib.pyplot as plt
 import numpy as np
 
 import vsr_jax as vsr
@@ -27,7 +28,8 @@ tip = eq.tip[:3, 3]
 print(eq)
 
 # %% picture
-vsr.plot.arm(eq).figure.savefig("arm.png")
+vsr.plot.arm(eq)
+plt.savefig("arm.png")
 
 
 # %% gradient

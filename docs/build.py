@@ -109,7 +109,7 @@ def with_entries(overview: str) -> str:
 def collect(folder: Path, execute: bool) -> None:
     """Writes the sources of the site."""
     pages = Pages(folder)
-    for page in (ROOT / "README.md", *sorted(DOCS.rglob("*.md"))):
+    for page in (ROOT / "README.md", DOCS / "style.css", *sorted(DOCS.rglob("*.md"))):
         pages.add(page)
     for notebook in sorted((ROOT / "notebooks").glob("*.ipynb")):
         pages.add_notebook(notebook, execute)
@@ -121,8 +121,8 @@ def draw_formulas(site: Path) -> None:
     def mathml(found: re.Match) -> str:
         tex = html.unescape(found[2]).strip().removeprefix("\\(").removeprefix("\\[")
         tex = tex.removesuffix("\\)").removesuffix("\\]")
-        made = convert(tex, display="inline" if found[1] == "span" else "block")
-        return made.replace("<mi>&#x02032;</mi>", '<mo class="prime">&#x02032;</mo>')
+        tex = tex.replace("'", r"\prime ")  # not raised twice
+        return convert(tex, display="inline" if found[1] == "span" else "block")
 
     for page in site.rglob("*.html"):
         page.write_text(FORMULA.sub(mathml, page.read_text("utf-8")), encoding="utf-8")

@@ -52,12 +52,16 @@ def test_the_reference_has_the_concepts_of_the_list_of_names():
         for heading, text in zip(concepts[::2], concepts[1::2], strict=True)
     }
     pages = (DOCS / "api").glob("*.md")
-    assert {read(page).splitlines()[0].removeprefix("# "): entries(page) for page in pages} == listed
+    assert {
+        read(page).splitlines()[0].removeprefix("# "): entries(page) for page in pages
+    } == listed
 
 
 def test_members_of_modules_that_the_reference_names_exist():
     for page in (DOCS / "api").glob("*.md"):
-        found = re.findall(r"^::: vsr_jax\.(\w+)\n.*\n +members: \[(.*)\]", read(page), re.MULTILINE)
+        found = re.findall(
+            r"^::: vsr_jax\.(\w+)\n.*\n +members: \[(.*)\]", read(page), re.MULTILINE
+        )
         for module, members in found:
             missing = [x for x in members.split(", ") if not hasattr(getattr(vsr, module), x)]
             assert missing == []
