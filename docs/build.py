@@ -78,17 +78,13 @@ class Pages:
         return f"{before}{new}#only-light)![]({new.replace('_light', '_dark')}#only-dark)"
 
     def add_notebook(self, path: Path, execute: bool) -> None:
-        """Adds a notebook as a page, with its figures beside it."""
+        """Adds a notebook as a page that contains its figures."""
         config = Config()
+        config.ExtractOutputPreprocessor.enabled = False
         if execute:
             config.MarkdownExporter.preprocessors = [ExecutePreprocessor(timeout=600)]
-        config.ExtractOutputPreprocessor.output_filename_template = (
-            path.stem + "_{cell_index}_{index}{extension}"
-        )
         resources = {"metadata": {"path": str(path.parent)}}
-        text, resources = MarkdownExporter(config=config).from_filename(str(path), resources)
-        for name, data in resources["outputs"].items():
-            self.write(place(path).with_name(name), data)
+        text, _ = MarkdownExporter(config=config).from_filename(str(path), resources)
         self.write(place(path), text.encode())
 
     def write(self, path: Path, data: bytes) -> None:

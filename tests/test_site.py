@@ -97,6 +97,13 @@ def test_the_errors_of_the_papers_cases_are_those_of_the_record():
         assert f"| {strain['strain_error']:.2g}" in text
 
 
+def test_the_distances_of_other_tools_are_those_of_the_record():
+    case = json.loads(read(RESULTS / "bench_peers_B1_2cores.json"))["scenes"]["B1"]
+    theirs = min(row["tip_error_max"] for row in case["rows"] if row["tool"] == "SoRoMoX")
+    scipy = min(row["tip_error"] for row in case["slow"] if row["tool"].startswith("SciPy"))
+    assert f"{two_digits(theirs)} m and {two_digits(scipy)} m" in read(DOCS / "validation.md")
+
+
 def test_the_errors_of_the_measured_tentacle_are_those_of_the_record():
     models = json.loads(read(RESULTS / "measured_tentacle.json"))["models"]
     text = " ".join(read(DOCS / "validation.md").split())
