@@ -58,7 +58,9 @@ def quick_start():
 @pytest.mark.parametrize(
     "page",
     [
-        pytest.param(page, id=page.stem, marks=[pytest.mark.slow] if page in SLOW else [])
+        pytest.param(
+            page, id=str(page.relative_to(DOCS)), marks=[pytest.mark.slow] if page in SLOW else []
+        )
         for page in PAGES
     ],
 )
