@@ -12,7 +12,7 @@ from vsr_jax.solution.quantities import QUANTITIES, AlongArm
 
 ROOT = pathlib.Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md"]
-PAGES += sorted((ROOT / "docs").glob("*.md"))
+PAGES += sorted((ROOT / "docs").rglob("*.md"))
 LONGEST_README = 800
 
 
@@ -49,7 +49,7 @@ def test_the_list_of_quantities_is_the_table():
     assert [line for line in text.splitlines() if line.startswith("| `eq.")] == rows
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_lead_somewhere(page):
     links = re.findall(r"\]\(([^)\s]+)\)", without_code(read(page)))
     for link in links:
@@ -62,12 +62,7 @@ def test_links_lead_somewhere(page):
         assert not anchor or anchor in anchors(target), link
 
 
-def test_every_page_is_linked_from_the_readme():
-    linked = {link.split("#")[0] for link in re.findall(r"\]\(([^)]+)\)", read(ROOT / "README.md"))}
-    assert {f"docs/{page.name}" for page in (ROOT / "docs").glob("*.md")} <= linked
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_names_in_the_text_exist(page):
     """`vsr.solve` and the like, in the text and in code."""
     names = set(re.findall(r"\bvsr\.([a-zA-Z]\w*)", read(page)))
