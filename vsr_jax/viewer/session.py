@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from ..analysis.inverse import Reach, reach
 from ..arm.scene import Scene
@@ -83,7 +83,9 @@ class Session:
     ):
         instance("scene", scene, Scene, "a Scene")
         dtype = scene.rod.length.dtype
-        given = scene.check_inputs(jnp.zeros(len(scene.actuators), dtype) if inputs is None else inputs)
+        given = scene.check_inputs(
+            jnp.zeros(len(scene.actuators), dtype) if inputs is None else inputs
+        )
         self.scene = cast(scene, given.dtype)
         self.model = StrainDependent() if model is None else model
         instance("model", self.model, Model, "StrainDependent(), Prescribed(basis) or Continuum()")
@@ -108,11 +110,22 @@ class Session:
         """The scene of a setting. Errors as for `current`."""
         return self.scene.replace(setting.numbers) if setting.numbers else self.scene
 
+    @property
+    def input_ranges(self) -> list[tuple[float, float]]:
+        """Least and greatest value of each input."""
+        return [(slider.low, slider.high) for slider in self.sliders if slider.of == INPUTS]
+
     def value(self, slider: Slider) -> float:
         """The number of a slider as it stands."""
         inputs, numbers = self.answer.setting
-        array = inputs if slider.of == INPUTS else numbers.get(slider.of, self._given.get(slider.of))
+        array = (
+            inputs if slider.of == INPUTS else numbers.get(slider.of, self._given.get(slider.of))
+        )
         return float(np.asarray(array)[slider.place])
+
+    def typed(self, values: np.ndarray) -> Array:
+        """Numbers in the precision of the session."""
+        return jnp.asarray(values, self._dtype)
 
     def moved(self, values: Mapping[str, float]) -> Setting:
         """The present setting with other numbers of the sliders of these names."""
@@ -153,16 +166,17 @@ class Session:
         start = self._start
         if start is None or not len(start.inputs):
             return self.answer
-        low, high = (
-            jnp.asarray([end(slider) for slider in self.sliders if slider.of == INPUTS], self._dtype)
-            for end in (lambda slider: slider.low, lambda slider: slider.high)
-        )
+        low, high = (self.typed(np.array([ends[i] for ends in self.input_ranges])) for i in (0, 1))
         zero = jnp.zeros((), self._dtype)
         near = Reach(start.inputs, start, zero, jnp.array(True), zero)
-        aim = jnp.asarray(target, self._dtype)
         with self.first("the drag of the tip"):
             found = reach(
-                start.scene, aim, (low, high), model=self.model, start=near, progress=False
+                start.scene,
+                self.typed(target),
+                (low, high),
+                model=self.model,
+                start=near,
+                progress=False,
             )
             miss = float(found.miss)
         if not np.isfinite(miss):
@@ -188,8 +202,7 @@ class Session:
 
         **Raises:** `ValueError` as `vsr_jax.files.to_toml`.
         """
-        inputs = jnp.asarray(self.answer.setting.inputs, self._dtype)
-        return to_toml(self.current, inputs, self.title)
+        return to_toml(self.current, self.typed(self.answer.setting.inputs), self.title)
 
     @contextmanager
     def first(self, program: str):
@@ -208,8 +221,7 @@ class Session:
         warm = scene.coupled and isinstance(self.model, StrainDependent)
         start = self._start if warm else None
         with self.first("the solve" if start is None else "the solve from a shape near by"):
-            values = jnp.asarray(inputs, self._dtype)
-            eq = solve(scene, values, model=self.model, start=start)
+            eq = solve(scene, self.typed(inputs), model=self.model, start=start)
             eq.status.block_until_ready()
         return eq
 

@@ -54,6 +54,11 @@ class Slider(NamedTuple):
         factor, prefix = fitting[0] if fitting else _PREFIXES[-1]
         return factor, prefix + self.unit
 
+    def in_si(self, shown: float) -> float:
+        """A number in the shown unit in SI units, without digits from rounding."""
+        factor = self.shown_unit[0]
+        return shown * factor if factor >= 1 else shown / round(1 / factor)
+
 
 def input_sliders(scene: Scene, inputs: np.ndarray, bounds: Any = None) -> list[Slider]:
     """A slider for each input.
@@ -101,7 +106,9 @@ def number_sliders(scene: Scene, chosen: Chosen) -> list[Slider]:
     found: dict[str, Slider] = {}
     for pattern, ends in ranges.items():
         for name in matching(pattern, known | entries):
-            each = [name] if name in entries else [e for e, (of, _) in entries.items() if of == name]
+            each = (
+                [name] if name in entries else [e for e, (of, _) in entries.items() if of == name]
+            )
             for entry in each:
                 found[entry] = _number_slider(scene, known, entry, *entries[entry], ends)
     return list(found.values())

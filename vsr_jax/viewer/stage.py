@@ -1,0 +1,251 @@
+"""The arm in the page: what viser draws in space, in a light and a dark theme."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.colors import to_rgb
+from matplotlib.typing import ColorType
+
+from ..arm.loads import Gravity
+from ..viz.space import FRAME_COLORS
+from ..viz.style import COLORS, Theme, mixed, settings
+from .coloring import BANDS, COLORINGS, Scale
+from .description import Shape
+from .mesh import ArrowScale, Mesh, bands, discs, segments, tube, tube_values
+from .session import Answer
+
+_FRAME = 0.13
+"""Length of the axes of the world's frame, relative to the arm."""
+_VIEW = np.array([0.46, -0.80, 0.37])
+"""Direction from the arm to the camera, that of the figures."""
+_DISTANCE = 2.1
+"""Distance of the camera in extents of the arm."""
+_OPACITY = {"strain": 0.75, "stress": 0.75, "tension": 0.3}
+_DIMMED, _DISC = 0.15, 0.25
+"""Opacity of the wall of a shape that is no equilibrium, and of discs."""
+_THREAD, _LINE = 4.0, 2.0
+"""Width of threads and of other lines [pixels]."""
+
+
+class Stage:
+    """Draws answers into the scene of a viser server.
+
+    **Arguments:** `server`: a `viser.ViserServer`; `length`: of the arm [m].
+
+    **Fields:** `scale`, of the colours; `drawn`, the number of answers that were drawn.
+    """
+
+    def __init__(self, server: Any, length: float):
+        self._server, self._length = server, length
+        self._nodes: dict[str, Any] = {}
+        self._arrows = ArrowScale()
+        self._widening: float | None = None
+        self.scale, self.drawn = Scale(COLORINGS["strain"]), 0
+        self.theme("light")
+        self._frame()
+
+    def theme(self, name: Theme) -> None:
+        """Switches between light and dark."""
+        style = settings(name)
+        self._paper, self._ink = style["axes.facecolor"], style["text.color"]
+        self._server.gui.configure_theme(
+            dark_mode=name == "dark",
+            show_logo=False,
+            show_share_button=False,
+            brand_color=_bytes(COLORS[0]),
+        )
+
+    def color_by(self, name: str) -> None:
+        """Selects one of `COLORINGS`."""
+        self.scale = Scale(COLORINGS[name])
+
+    @property
+    def widening(self) -> float:
+        """Factor by which the arm is drawn wider than it is, that of the first shape."""
+        return 1.0 if self._widening is None else self._widening
+
+    def draw(self, answer: Answer) -> None:
+        """Shows an answer; a shape that is no equilibrium of its setting is dimmed."""
+        shape, good = answer.shape, answer.failure is None
+        if shape is not None:
+            if self._widening is None:
+                self._widening = shape.body.widening
+                self._look_at(shape)
+            with self._server.atomic():
+                self._draw_wall(shape, good)
+                self._draw_threads(shape, good)
+                self._draw_loads(shape, good)
+            self._server.flush()
+        self.drawn += 1
+
+    def _draw_wall(self, shape: Shape, good: bool) -> None:
+        wall = tube(shape.body.widened(self.widening).samples.wall)
+        values = self.scale.coloring.values(shape)
+        self.scale.cover(values)
+        plain = not good or self.scale.coloring is COLORINGS["tension"]
+        opacity = _OPACITY[_name(self.scale)] if good else _DIMMED
+        if plain:
+            self._mesh("/arm/wall/plain", wall, self._gray(0.5), opacity)
+            parts = [Mesh(wall.vertices[:0], wall.triangles[:0])] * BANDS
+        else:
+            self._hide("/arm/wall/plain")
+            level = self.scale.levels(tube_values(values)[wall.triangles].mean(axis=1))
+            parts = bands(wall, level, BANDS)
+        for i, (part, color) in enumerate(zip(parts, self.scale.colors(), strict=True)):
+            self._mesh(f"/arm/wall/{i}", part, color, opacity)
+        rims = shape.body.widened(self.widening).discs
+        color = self._gray(0.5)
+        self._mesh("/arm/discs", discs(rims), color, _DISC if good else _DIMMED, side="double")
+
+    def _draw_threads(self, shape: Shape, good: bool) -> None:
+        body = shape.body.widened(self.widening)
+        slack = np.zeros(len(body.samples.threads), bool) if body.slack is None else body.slack
+        points, thread = segments(np.asarray(body.samples.threads), slack)
+        color = np.broadcast_to(self._gray(0.8 if good else 0.35), (len(slack), 3))
+        if good and self.scale.coloring is COLORINGS["tension"] and body.tension is not None:
+            color = self.scale.colors()[self.scale.levels(body.tension)]
+        colors = np.repeat(color[thread][:, None], 2, axis=1)
+        self._lines("/arm/threads", points, colors, _THREAD)
+        axis = np.asarray(body.samples.position)
+        axis = np.stack([axis[:-1], axis[1:]], axis=1)
+        gray = np.broadcast_to(self._gray(0.6 if good else 0.3), axis.shape)
+        self._lines("/arm/axis", axis, gray, _LINE)
+
+    def _draw_loads(self, shape: Shape, good: bool) -> None:
+        rows = shape.loads if good else []
+        arrows = self._arrows.arrows(rows, self._length)
+        points = np.concatenate([np.zeros((0, 2, 3)), *arrows])
+        colors = [
+            np.broadcast_to(_bytes(load_color(len(row.places) == 1, row.moment)), (len(a), 3))
+            for row, a in zip(rows, arrows, strict=True)
+        ]
+        self._arrow_node("/loads", points, np.concatenate([np.zeros((0, 3)), *colors]), 0.004)
+        gravity = [x.acceleration for x in shape.equilibrium.scene.loads if isinstance(x, Gravity)]
+        total = np.sum(np.asarray(gravity, float).reshape(-1, 3), axis=0)
+        self._gravity(total)
+
+    def _frame(self) -> None:
+        size = _FRAME * self._length
+        start = np.zeros((3, 3))
+        ends = size * np.eye(3)
+        colors = np.array([_bytes(color) for color in FRAME_COLORS])
+        self._arrow_node("/world/frame", np.stack([start, ends], axis=1), colors, 0.005)
+        for name, end in zip("xyz", 1.15 * ends, strict=True):
+            self._server.scene.add_label(
+                f"/world/{name}", name, position=end, anchor="center-center"
+            )
+        self._server.scene.add_grid(
+            "/world/ground",
+            width=4 * self._length,
+            height=4 * self._length,
+            cell_size=self._length / 10,
+            section_size=self._length / 2,
+            cell_color=_bytes("#cccccc"),
+            section_color=_bytes("#999999"),
+            plane_opacity=0.0,
+            infinite_grid=False,
+            fade_distance=6 * self._length,
+        )
+
+    def _gravity(self, acceleration: np.ndarray) -> None:
+        size = float(np.linalg.norm(acceleration))
+        if size == 0:
+            self._hide("/world/gravity")
+            self._hide("/world/g")
+            return
+        start = np.array([0.0, -0.25, 0.25]) * self._length
+        end = start + _FRAME * self._length * acceleration / size
+        color = np.array([self._gray(0.7)])
+        self._arrow_node("/world/gravity", np.stack([start, end])[None], color, 0.005)
+        label = self._nodes.get("/world/g")
+        if label is None:
+            label = self._nodes["/world/g"] = self._server.scene.add_label("/world/g", "g")
+        label.position, label.visible = end, True
+
+    def _look_at(self, shape: Shape) -> None:
+        points = np.concatenate([shape.body.points, np.zeros((1, 3))])
+        low, high = points.min(axis=0), points.max(axis=0)
+        middle, extent = (low + high) / 2, float(np.max(high - low))
+        camera = self._server.initial_camera
+        camera.position, camera.look_at = middle + _DISTANCE * extent * _VIEW, middle
+        camera.up, camera.near = (0.0, 0.0, 1.0), 0.01 * extent
+        for client in self._server.get_clients().values():
+            client.camera.position, client.camera.look_at = camera.position, camera.look_at
+
+    def _gray(self, strength: float) -> np.ndarray:
+        return _bytes(mixed(self._paper, self._ink, strength))
+
+    def _mesh(
+        self, name: str, mesh: Mesh, color: np.ndarray, opacity: float, side: str = "front"
+    ) -> None:
+        if not len(mesh.triangles):
+            self._hide(name)
+            return
+        node = self._nodes.get(name)
+        if node is None:
+            self._nodes[name] = self._server.scene.add_mesh_simple(
+                name,
+                mesh.vertices,
+                mesh.triangles,
+                color=color,
+                opacity=opacity,
+                side=side,
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+            return
+        node.vertices, node.faces = (
+            mesh.vertices.astype(np.float32),
+            mesh.triangles.astype(np.uint32),
+        )
+        node.color, node.opacity, node.visible = tuple(color.tolist()), opacity, True
+
+    def _lines(self, name: str, points: np.ndarray, colors: np.ndarray, width: float) -> None:
+        if not len(points):
+            self._hide(name)
+            return
+        node = self._nodes.get(name)
+        if node is None:
+            self._nodes[name] = self._server.scene.add_line_segments(
+                name, points, colors.astype(np.uint8), thickness=width, thickness_units="screen"
+            )
+            return
+        node.points, node.colors = points.astype(np.float32), colors.astype(np.uint8)
+        node.visible = True
+
+    def _arrow_node(self, name: str, points: np.ndarray, colors: np.ndarray, radius: float) -> None:
+        if not len(points):
+            self._hide(name)
+            return
+        node = self._nodes.get(name)
+        if node is None:
+            self._nodes[name] = self._server.scene.add_arrows(
+                name,
+                points,
+                colors.astype(np.uint8),
+                shaft_radius=radius * self._length,
+                head_radius=3 * radius * self._length,
+                head_length=8 * radius * self._length,
+            )
+            return
+        node.points, node.colors = points.astype(np.float32), colors.astype(np.uint8)
+        node.visible = True
+
+    def _hide(self, name: str) -> None:
+        if name in self._nodes:
+            self._nodes[name].visible = False
+
+
+def load_color(at_point: bool, moment: bool) -> ColorType:
+    """Colour of the arrows of a load: forces and moments at points, and along the arm."""
+    if moment:
+        return COLORS[2]
+    return COLORS[3] if at_point else COLORS[4]
+
+
+def _name(scale: Scale) -> str:
+    return next(name for name, coloring in COLORINGS.items() if coloring is scale.coloring)
+
+
+def _bytes(color: ColorType) -> Any:
+    return np.rint(255 * np.array(to_rgb(color))).astype(np.uint8)
