@@ -131,7 +131,7 @@ class View:
         )
         self._tip = server.scene.add_transform_controls(
             "/tip",
-            scale=0.2 * float(session.scene.rod.length),
+            scale=0.13 * float(session.scene.rod.length),
             disable_rotations=True,
             depth_test=False,
             visible=False,

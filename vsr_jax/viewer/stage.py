@@ -16,11 +16,14 @@ from .session import Answer
 
 _FRAME = 0.13
 """Length of the axes of the world's frame, relative to the arm."""
+_GRAVITY = np.array([-0.12, 0.0, 0.12])
+"""Where the arrow of gravity starts, relative to the arm."""
 _VIEW = np.array([0.46, -0.80, 0.37])
 """Direction from the arm to the camera, that of the figures."""
-_DISTANCE = 2.1
-"""Distance of the camera in extents of the arm."""
-_OPACITY = {"strain": 0.75, "stress": 0.75, "tension": 0.3}
+_ANGLE, _DISTANCE, _ASIDE = 0.7, 2.2, 0.2
+"""Angle of view [rad]; distance of the camera, and how far the controls at the right move what it
+looks at, in extents of the arm."""
+_OPACITY = {"strain": 0.7, "stress": 0.7, "tension": 0.4}
 _DIMMED, _DISC = 0.15, 0.25
 """Opacity of the wall of a shape that is no equilibrium, and of discs."""
 _THREAD, _LINE = 4.0, 2.0
@@ -42,7 +45,6 @@ class Stage:
         self._widening: float | None = None
         self.scale, self.drawn = Scale(COLORINGS["strain"]), 0
         self.theme("light")
-        self._frame()
 
     def theme(self, name: Theme) -> None:
         """Switches between light and dark."""
@@ -54,6 +56,7 @@ class Stage:
             show_share_button=False,
             brand_color=_bytes(COLORS[0]),
         )
+        self._frame()
 
     def color_by(self, name: str) -> None:
         """Selects one of `COLORINGS`."""
@@ -136,15 +139,14 @@ class Stage:
             )
         self._server.scene.add_grid(
             "/world/ground",
-            width=4 * self._length,
-            height=4 * self._length,
+            width=2 * self._length,
+            height=2 * self._length,
             cell_size=self._length / 10,
             section_size=self._length / 2,
-            cell_color=_bytes("#cccccc"),
-            section_color=_bytes("#999999"),
-            plane_opacity=0.0,
-            infinite_grid=False,
-            fade_distance=6 * self._length,
+            cell_color=self._gray(0.12),
+            section_color=self._gray(0.25),
+            cell_thickness=0.6,
+            section_thickness=0.8,
         )
 
     def _gravity(self, acceleration: np.ndarray) -> None:
@@ -153,7 +155,7 @@ class Stage:
             self._hide("/world/gravity")
             self._hide("/world/g")
             return
-        start = np.array([0.0, -0.25, 0.25]) * self._length
+        start = _GRAVITY * self._length
         end = start + _FRAME * self._length * acceleration / size
         color = np.array([self._gray(0.7)])
         self._arrow_node("/world/gravity", np.stack([start, end])[None], color, 0.005)
@@ -165,19 +167,20 @@ class Stage:
     def _look_at(self, shape: Shape) -> None:
         points = np.concatenate([shape.body.points, np.zeros((1, 3))])
         low, high = points.min(axis=0), points.max(axis=0)
-        middle, extent = (low + high) / 2, float(np.max(high - low))
+        extent = float(np.max(high - low))
+        right = np.cross((0.0, 0.0, 1.0), _VIEW)
+        middle = (low + high) / 2 + _ASIDE * extent * right / np.linalg.norm(right)
         camera = self._server.initial_camera
         camera.position, camera.look_at = middle + _DISTANCE * extent * _VIEW, middle
-        camera.up, camera.near = (0.0, 0.0, 1.0), 0.01 * extent
+        camera.up, camera.near, camera.fov = (0.0, 0.0, 1.0), 0.01 * extent, _ANGLE
         for client in self._server.get_clients().values():
+            client.camera.fov = camera.fov
             client.camera.position, client.camera.look_at = camera.position, camera.look_at
 
-    def _gray(self, strength: float) -> np.ndarray:
+    def _gray(self, strength: float) -> tuple[int, int, int]:
         return _bytes(mixed(self._paper, self._ink, strength))
 
-    def _mesh(
-        self, name: str, mesh: Mesh, color: np.ndarray, opacity: float, side: str = "front"
-    ) -> None:
+    def _mesh(self, name: str, mesh: Mesh, color: Any, opacity: float, side: str = "front") -> None:
         if not len(mesh.triangles):
             self._hide(name)
             return
@@ -198,7 +201,7 @@ class Stage:
             mesh.vertices.astype(np.float32),
             mesh.triangles.astype(np.uint32),
         )
-        node.color, node.opacity, node.visible = tuple(color.tolist()), opacity, True
+        node.color, node.opacity, node.visible = tuple(int(x) for x in color), opacity, True
 
     def _lines(self, name: str, points: np.ndarray, colors: np.ndarray, width: float) -> None:
         if not len(points):
@@ -207,10 +210,10 @@ class Stage:
         node = self._nodes.get(name)
         if node is None:
             self._nodes[name] = self._server.scene.add_line_segments(
-                name, points, colors.astype(np.uint8), thickness=width, thickness_units="screen"
+                name, points, linear(colors), thickness=width, thickness_units="screen"
             )
             return
-        node.points, node.colors = points.astype(np.float32), colors.astype(np.uint8)
+        node.points, node.colors = points.astype(np.float32), linear(colors)
         node.visible = True
 
     def _arrow_node(self, name: str, points: np.ndarray, colors: np.ndarray, radius: float) -> None:
@@ -222,13 +225,13 @@ class Stage:
             self._nodes[name] = self._server.scene.add_arrows(
                 name,
                 points,
-                colors.astype(np.uint8),
+                linear(colors),
                 shaft_radius=radius * self._length,
                 head_radius=3 * radius * self._length,
                 head_length=8 * radius * self._length,
             )
             return
-        node.points, node.colors = points.astype(np.float32), colors.astype(np.uint8)
+        node.points, node.colors = points.astype(np.float32), linear(colors)
         node.visible = True
 
     def _hide(self, name: str) -> None:
@@ -243,9 +246,18 @@ def load_color(at_point: bool, moment: bool) -> ColorType:
     return COLORS[3] if at_point else COLORS[4]
 
 
+def linear(colors: np.ndarray) -> np.ndarray:
+    """Colours as bytes (sRGB) in linear light, which viser expects for lines and arrows, but not
+    for meshes."""
+    share = np.asarray(colors, float) / 255
+    light = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    return np.rint(255 * light).astype(np.uint8)
+
+
 def _name(scale: Scale) -> str:
     return next(name for name, coloring in COLORINGS.items() if coloring is scale.coloring)
 
 
-def _bytes(color: ColorType) -> Any:
-    return np.rint(255 * np.array(to_rgb(color))).astype(np.uint8)
+def _bytes(color: ColorType) -> tuple[int, int, int]:
+    red, green, blue = (round(255 * x) for x in to_rgb(color))
+    return red, green, blue
