@@ -200,9 +200,10 @@ def _run(
             point = states.z
             states, row = descend(problem, rule, states, penalty_weight(done, search.steps))
             bar.set_description("designing", refresh=done == first)  # compiled by the first step
-            rows.append(History(*row, point))
-        new = jax.tree.map(lambda *x: np.stack(x), *rows)
-        new = new._replace(numbers=problem.at(jax.tree.map(jnp.asarray, new.numbers)))
+            rows.append((*row, point))
+        objective, violation, points = jax.tree.map(lambda *x: np.stack(x), *rows)
+        numbers = problem.at(jax.tree.map(jnp.asarray, points))
+        new = History(objective, violation, jax.tree.map(np.asarray, numbers))
         history = jax.tree.map(lambda old, more: np.concatenate([old, more]), history, new)
         checkpoint.write(states, history)
         best = best_start(states.best)

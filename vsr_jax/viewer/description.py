@@ -49,7 +49,8 @@ class Shape(NamedTuple):
 
 def shape_of(eq: Equilibrium) -> Shape:
     """The shape of a converged equilibrium."""
-    samples, strain, stress, wrenches = jax.device_get(_described(eq))
+    *described, wrenches = _described(eq)
+    samples, strain, stress = jax.device_get(described)
     return Shape(
         eq,
         body_from_samples(eq, samples),

@@ -117,12 +117,13 @@ def viewer_library() -> Any:
 class View:
     """A page that is served.
 
-    **Fields:** `url`; `session`: inputs, numbers and the last answer. A `with` statement closes it.
+    **Fields:** `url`; `session`: inputs, numbers and the last answer; `server`: the
+    `viser.ViserServer`, which takes more than is drawn here. A `with` statement closes it.
     """
 
     def __init__(self, server: Any, session: Session, tracks: Sequence[Track], theme: Theme):
-        self.session = session
-        self._server, self._worker, self._ended = server, Worker(), threading.Event()
+        self.session, self.server = session, server
+        self._worker, self._ended = Worker(), threading.Event()
         self._stage = Stage(server, float(session.scene.rod.length))
         self._stage.theme(theme)
         values = [session.value(slider) for slider in session.sliders]
@@ -146,7 +147,7 @@ class View:
     @property
     def url(self) -> str:
         """Address of the page."""
-        return f"http://{self._server.get_host()}:{self._server.get_port()}"
+        return f"http://{self.server.get_host()}:{self.server.get_port()}"
 
     def wait(self) -> None:
         """Waits until Ctrl-C, or until the view is closed."""
@@ -162,7 +163,7 @@ class View:
             self._ended.set()
             self._player.pause()
             self._worker.close()
-            self._server.stop()
+            self.server.stop()
 
     def __enter__(self) -> "View":
         return self
@@ -198,7 +199,7 @@ class View:
 
     def _compiling(self, program: str) -> None:
         self._panel.status.content = status_html(self.session.answer, program)
-        self._server.flush()
+        self.server.flush()
 
     def _connect(self) -> None:
         panel = self._panel

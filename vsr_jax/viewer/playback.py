@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..analysis.following import follow
+from ..models.strain_dependent import StrainDependent
 from ..optimization.design_search import Design
 from ..optimization.problem import INPUTS
 from ..solution.equilibrium import Equilibrium
@@ -53,11 +54,14 @@ def path_of(session: Session, slider: Slider) -> Track:
     where the arm comes from."""
     if slider.of != INPUTS:
         raise ValueError(f"slider: got {slider.name}, need an input for a path with friction")
+    model = session.model
+    if not isinstance(model, StrainDependent):
+        raise ValueError(f"model: got {model}, need a StrainDependent for a path with friction")
     way = np.linspace(slider.low, slider.high, FRAMES)
     inputs = np.tile(session.answer.setting.inputs, (2 * FRAMES, 1))
     inputs[:, slider.place[0]] = np.concatenate([way, way[::-1]])
     with session.first("the path"):
-        path = follow(session.current, session.typed(inputs), model=session.model)
+        path = follow(session.current, session.typed(inputs), model=model)
         path = jax.block_until_ready(path)
     return Track("path", _frames_of(path))
 

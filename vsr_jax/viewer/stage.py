@@ -7,6 +7,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.typing import ColorType
 
 from ..arm.loads import Gravity
+from ..viz.body import Body
 from ..viz.space import FRAME_COLORS
 from ..viz.style import COLORS, Theme, mixed, settings
 from .coloring import BANDS, COLORINGS, Scale
@@ -20,14 +21,17 @@ _GRAVITY = np.array([-0.12, 0.0, 0.12])
 """Where the arrow of gravity starts, relative to the arm."""
 _VIEW = np.array([0.46, -0.80, 0.37])
 """Direction from the arm to the camera, that of the figures."""
-_ANGLE, _DISTANCE, _ASIDE = 0.7, 2.2, 0.2
+_ANGLE, _DISTANCE, _ASIDE = 0.7, 1.8, 0.2
 """Angle of view [rad]; distance of the camera, and how far the controls at the right move what it
 looks at, in extents of the arm."""
 _OPACITY = {"strain": 0.7, "stress": 0.7, "tension": 0.4}
 _DIMMED, _DISC = 0.15, 0.25
 """Opacity of the wall of a shape that is no equilibrium, and of discs."""
-_THREAD, _LINE = 4.0, 2.0
-"""Width of threads and of other lines [pixels]."""
+_THREAD = 4.0
+"""Width of threads [pixels]."""
+_THIN, _WITHIN = 0.012, 0.5
+"""Radius of a wall relative to the arm's extent below which it is drawn wider, up to this share of
+its discs."""
 
 
 class Stage:
@@ -42,7 +46,7 @@ class Stage:
         self._server, self._length = server, length
         self._nodes: dict[str, Any] = {}
         self._arrows = ArrowScale()
-        self._widening: float | None = None
+        self._factors: tuple[float, float] | None = None
         self.scale, self.drawn = Scale(COLORINGS["strain"]), 0
         self.theme("light")
 
@@ -64,25 +68,27 @@ class Stage:
 
     @property
     def widening(self) -> float:
-        """Factor by which the arm is drawn wider than it is, that of the first shape."""
-        return 1.0 if self._widening is None else self._widening
+        """Factor by which the wall is drawn wider than it is, that of the first shape."""
+        return 1.0 if self._factors is None else self._factors[1]
 
     def draw(self, answer: Answer) -> None:
         """Shows an answer; a shape that is no equilibrium of its setting is dimmed."""
         shape, good = answer.shape, answer.failure is None
         if shape is not None:
-            if self._widening is None:
-                self._widening = shape.body.widening
+            if self._factors is None:
+                self._factors = factors(shape.body)
                 self._look_at(shape)
+            body = shape.body.widened(self._factors[0])
             with self._server.atomic():
                 self._draw_wall(shape, good)
-                self._draw_threads(shape, good)
+                self._draw_discs(body, good)
+                self._draw_threads(body, good)
                 self._draw_loads(shape, good)
             self._server.flush()
         self.drawn += 1
 
     def _draw_wall(self, shape: Shape, good: bool) -> None:
-        wall = tube(shape.body.widened(self.widening).samples.wall)
+        wall = tube(np.asarray(shape.body.widened(self.widening).samples.wall))
         values = self.scale.coloring.values(shape)
         self.scale.cover(values)
         plain = not good or self.scale.coloring is COLORINGS["tension"]
@@ -96,12 +102,12 @@ class Stage:
             parts = bands(wall, level, BANDS)
         for i, (part, color) in enumerate(zip(parts, self.scale.colors(), strict=True)):
             self._mesh(f"/arm/wall/{i}", part, color, opacity)
-        rims = shape.body.widened(self.widening).discs
-        color = self._gray(0.5)
-        self._mesh("/arm/discs", discs(rims), color, _DISC if good else _DIMMED, side="double")
 
-    def _draw_threads(self, shape: Shape, good: bool) -> None:
-        body = shape.body.widened(self.widening)
+    def _draw_discs(self, body: Body, good: bool) -> None:
+        opacity = _DISC if good else _DIMMED
+        self._mesh("/arm/discs", discs(body.discs), self._gray(0.5), opacity, side="double")
+
+    def _draw_threads(self, body: Body, good: bool) -> None:
         slack = np.zeros(len(body.samples.threads), bool) if body.slack is None else body.slack
         points, thread = segments(np.asarray(body.samples.threads), slack)
         color = np.broadcast_to(self._gray(0.8 if good else 0.35), (len(slack), 3))
@@ -109,10 +115,6 @@ class Stage:
             color = self.scale.colors()[self.scale.levels(body.tension)]
         colors = np.repeat(color[thread][:, None], 2, axis=1)
         self._lines("/arm/threads", points, colors, _THREAD)
-        axis = np.asarray(body.samples.position)
-        axis = np.stack([axis[:-1], axis[1:]], axis=1)
-        gray = np.broadcast_to(self._gray(0.6 if good else 0.3), axis.shape)
-        self._lines("/arm/axis", axis, gray, _LINE)
 
     def _draw_loads(self, shape: Shape, good: bool) -> None:
         rows = shape.loads if good else []
@@ -165,7 +167,8 @@ class Stage:
         label.position, label.visible = end, True
 
     def _look_at(self, shape: Shape) -> None:
-        points = np.concatenate([shape.body.points, np.zeros((1, 3))])
+        around = self._length * np.stack([1.2 * _FRAME * np.ones(3), np.zeros(3), _GRAVITY])
+        points = np.concatenate([shape.body.points, around])
         low, high = points.min(axis=0), points.max(axis=0)
         extent = float(np.max(high - low))
         right = np.cross((0.0, 0.0, 1.0), _VIEW)
@@ -237,6 +240,18 @@ class Stage:
     def _hide(self, name: str) -> None:
         if name in self._nodes:
             self._nodes[name].visible = False
+
+
+def factors(body: Body) -> tuple[float, float]:
+    """Factors by which an arm is drawn wider to be seen: all of it, and its wall."""
+    if body.widening > 1 or not body.discs.size:
+        return body.widening, body.widening
+    axis = np.asarray(body.samples.position)
+    radius = float(np.max(np.linalg.norm(body.samples.wall - axis[:, None], axis=-1)))
+    rims = np.linalg.norm(body.discs - body.discs.mean(axis=1, keepdims=True), axis=-1)
+    extent = float(np.max(np.ptp(axis, axis=0)))
+    wanted = min(_THIN * extent, _WITHIN * float(np.max(rims)))
+    return 1.0, float(f"{wanted / radius:.2g}") if radius < wanted else 1.0
 
 
 def load_color(at_point: bool, moment: bool) -> ColorType:
