@@ -134,7 +134,7 @@ class Browser:
 
     def shot(self, name):
         if self.folder is not None:
-            time.sleep(2.0)  # for the software renderer
+            time.sleep(5.0)  # for the software renderer
             self.tab.screenshot(path=self.folder / f"{name}.png")
 
     def says(self, text):
@@ -153,7 +153,7 @@ class Browser:
 
     def slider(self, label):
         """The thumb of a slider, and the box with its number."""
-        row = self.tab.get_by_text(label, exact=True).locator("xpath=../..")
+        row = self.tab.locator("label").filter(has_text=label).locator("xpath=../../..")
         return row.get_by_role("slider").first, row.get_by_role("textbox").first
 
     def pixel(self, point):
@@ -204,11 +204,14 @@ def _slides(page, browser):
     np.testing.assert_allclose(browser.tip_said(), expected(page).tip[:3, 3], atol=1e-4)
     browser.shot("strain")
     thumb, box = browser.slider(f"{FORCE} [mN]")
-    thumb.focus()
-    for _ in range(30):
-        tab.keyboard.press("ArrowRight")
+    place = thumb.bounding_box()
+    middle = place["x"] + place["width"] / 2, place["y"] + place["height"] / 2
+    tab.mouse.move(*middle)
+    tab.mouse.down()
+    tab.mouse.move(middle[0] + 40, middle[1], steps=20)
+    tab.mouse.up()
     browser.waits_for(
-        lambda: page.session.answer.setting.numbers.get("loads[0].force", [0, 0, -1])[2] > -0.05
+        lambda: page.session.answer.setting.numbers.get("loads[0].force", [0, 0, -1])[2] > 0.0
     )
     box.fill("40")
     browser.waits_for(lambda: page.session.answer.setting.numbers["loads[0].force"][2] == 0.04)
@@ -217,17 +220,15 @@ def _slides(page, browser):
     browser.waits_for(lambda: page.session.answer.setting.inputs[1] == 2.5)
     browser.waits_for(lambda: np.allclose(browser.tip_said(), expected(page).tip[:3, 3], atol=1e-4))
     drawn_axis(page)
-    for choice in ("stress", "tension"):
-        tab.get_by_role("textbox").and_(
-            tab.locator("input[value=strain],input[value=stress]")
-        ).first.click()
+    for choice, label in (("stress", "von Mises stress"), ("tension", "thread tension")):
+        tab.get_by_label("colour").click()
         tab.get_by_role("option", name=choice).click()
-        browser.says({"stress": "von Mises stress [Pa]", "tension": "thread tension [N]"}[choice])
+        browser.says(label)
         browser.shot(choice)
     assert node(page, "/arm/wall/plain").visible
-    tab.get_by_text("dark", exact=True).locator("xpath=../..").get_by_role("checkbox").check()
+    tab.get_by_label("dark", exact=True).check()
     browser.shot("dark")
-    tab.get_by_text("dark", exact=True).locator("xpath=../..").get_by_role("checkbox").uncheck()
+    tab.get_by_label("dark", exact=True).uncheck()
 
 
 def _drags(page, browser):

@@ -328,7 +328,7 @@ def test_arrows_keep_their_scale():
 
 def test_scales_of_colours_are_round_and_follow_slowly():
     scale = coloring.Scale(coloring.COLORINGS["strain"])
-    for greatest, high in ((0.03, 0.05), (-0.04, 0.05), (0.06, 0.1), (0.021, 0.1), (0.015, 0.02)):
+    for greatest, high in ((0.025, 0.03), (-0.03, 0.03), (0.07, 0.08), (0.05, 0.08), (0.019, 0.02)):
         scale.cover(np.array([0.0, greatest]))
         assert scale.high == pytest.approx(high)
         assert scale.low == -scale.high
@@ -342,7 +342,8 @@ def test_scales_of_colours_are_round_and_follow_slowly():
     assert "0.02 long" in scale.html()
     stress = coloring.Scale(coloring.COLORINGS["stress"])
     stress.cover(np.array([3.1e4]))
-    assert (stress.low, stress.high) == (0.0, 5e4)
+    assert (stress.low, stress.high) == (0.0, 4e4)
+    assert "40 kPa" in stress.html()
     tension = coloring.Scale(coloring.COLORINGS["tension"])
     tension.cover(np.zeros(2))
     assert set(tension.levels(np.zeros(2))) == {coloring.BANDS // 2}

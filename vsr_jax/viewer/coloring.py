@@ -9,22 +9,26 @@ from matplotlib.colors import Colormap, to_hex
 
 from ..viz.style import TENSION
 from .description import Shape
+from .sliders import prefixed
 
 BANDS = 32
 """Colours of a scale. The page colours triangles, not points."""
 
-_SHRINK = 0.2
+_SHRINK = 0.5
 """Share of a scale below which it becomes smaller."""
+_ROUND = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
+"""Ends of scales, times a power of ten."""
 
 
 class Coloring(NamedTuple):
     """A quantity that is shown in colour.
 
-    **Fields:** its name with the unit; the `values` at the wall, or of the threads; `signed`,
+    **Fields:** its name and its `unit`; the `values` at the wall, or of the threads; `signed`,
     whether zero is in the middle of the scale; `ends`, what its lowest and its highest value mean.
     """
 
     label: str
+    unit: str
     values: Callable[[Shape], np.ndarray]
     signed: bool
     ends: tuple[str, str] = ("", "")
@@ -41,9 +45,9 @@ def _tension(shape: Shape) -> np.ndarray:
 
 
 COLORINGS = {
-    "strain": Coloring("strain along the arm [-]", lambda s: s.strain, True, ("short", "long")),
-    "stress": Coloring("von Mises stress [Pa]", lambda s: s.stress, False),
-    "tension": Coloring("thread tension [N]", _tension, True, ("pushes", "pulls")),
+    "strain": Coloring("strain along the arm", "", lambda s: s.strain, True, ("short", "long")),
+    "stress": Coloring("von Mises stress", "Pa", lambda s: s.stress, False),
+    "tension": Coloring("thread tension", "N", _tension, True, ("pushes", "pulls")),
 }
 """The choices by name."""
 
@@ -80,8 +84,11 @@ class Scale:
     def html(self) -> str:
         """The colour bar for the page."""
         stops = ", ".join(to_hex(self.coloring.map(x)) for x in np.linspace(0, 1, 9))
-        low, high = self.coloring.ends
-        ends = [f"{self.low:.3g} {low}".strip(), f"{self.high:.3g} {high}".strip()]
+        factor, unit = prefixed(self.high, self.coloring.unit)
+        ends = [
+            f"{round(x / factor, 6):.3g} {unit} {meaning}".strip()
+            for x, meaning in zip((self.low, self.high), self.coloring.ends, strict=True)
+        ]
         return (
             '<div style="padding:0.2em 0.9em;font-size:0.8em">'
             f"<div>{self.coloring.label}</div>"
@@ -92,8 +99,8 @@ class Scale:
 
 
 def rounded_up(value: float) -> float:
-    """The next 1, 2 or 5 times a power of ten; 0 for 0."""
+    """The next round number, 0 for 0."""
     if value <= 0:
         return 0.0
     power = 10.0 ** np.floor(np.log10(value))
-    return float(next(m * power for m in (1, 2, 5, 10) if m * power >= value * (1 - 1e-9)))
+    return float(next(m * power for m in _ROUND if m * power >= value * (1 - 1e-9)))

@@ -28,7 +28,7 @@ def tube(wall: Float[np.ndarray, "stations angles 3"]) -> Mesh:
     index = np.arange(stations * angles).reshape(stations, angles)
     following = np.roll(index, -1, axis=1)
     a, b, c, d = index[:-1], following[:-1], following[1:], index[1:]
-    skin = np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
+    skin = np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)  # two for each quadrilateral
     base, tip = stations * angles, stations * angles + 1
     ends = [
         np.stack([np.full(angles, base), following[0], index[0]], axis=-1),
@@ -38,10 +38,14 @@ def tube(wall: Float[np.ndarray, "stations angles 3"]) -> Mesh:
     return Mesh(np.concatenate([rings.reshape(-1, 3), middles]), np.concatenate([skin, *ends]))
 
 
-def tube_values(values: Float[np.ndarray, "stations angles"]) -> Float[np.ndarray, " vertices"]:
-    """Values at the wall as values at the vertices of its `tube`."""
-    rings = values[:, :-1]
-    return np.concatenate([rings.reshape(-1), rings[[0, -1]].mean(axis=1)])
+def tube_values(
+    values: Float[np.ndarray, "stations angles"],
+) -> Float[np.ndarray, " triangles"]:
+    """Values at the wall as values of the triangles of its `tube`: the mean of each quadrilateral,
+    and at the ends of each edge."""
+    edges = (values[:, :-1] + values[:, 1:]) / 2
+    skin = np.repeat(((edges[:-1] + edges[1:]) / 2).reshape(-1), 2)
+    return np.concatenate([skin, edges[0], edges[-1]])
 
 
 def bands(mesh: Mesh, level: Int[np.ndarray, " triangles"], count: int) -> list[Mesh]:

@@ -39,7 +39,7 @@ class Panel:
         tracks: Sequence[str],
         theme: str,
     ):
-        self.status = gui.add_html(status_html(None, "the solve"))
+        self.status = gui.add_html(status_html(None, ""))
         self.sliders: dict[str, tuple[Slider, Any]] = {}
         for title, inputs in (("Inputs", True), ("Numbers", False)):
             shown = [
@@ -109,8 +109,10 @@ def status_html(answer: Answer | None, compiling: str) -> str:
     color, lines = _BUSY, []
     if compiling:
         lines = [f"compiling {compiling} &hellip;"]
-    elif answer is None or answer.shape is None:
-        color, lines = _BAD, [html.escape((answer and answer.failure) or "no shape")]
+    elif answer is None or (answer.shape is None and answer.failure is None):
+        lines = ["starting &hellip;"]
+    elif answer.shape is None:
+        color, lines = _BAD, ["no equilibrium", html.escape(answer.failure or "")]
     elif answer.failure is not None:
         color = _BAD
         lines = ["no equilibrium", html.escape(answer.failure), "dimmed: the last shape"]

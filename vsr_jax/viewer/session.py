@@ -5,7 +5,7 @@ Every answer comes from the same few compiled programs, whatever the inputs and 
 they are arrays of the scene, not constants of the programs.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -205,7 +205,7 @@ class Session:
         return to_toml(self.current, self.typed(self.answer.setting.inputs), self.title)
 
     @contextmanager
-    def first(self, program: str):
+    def first(self, program: str) -> Iterator[None]:
         """Context of a computation that compiles when it runs for the first time."""
         new = program not in self._compiled
         if new:

@@ -47,17 +47,22 @@ class Slider(NamedTuple):
     def shown_unit(self) -> tuple[float, str]:
         """Factor and name of the unit in which the slider is shown: with a prefix for which its
         values are between 1 and 1000."""
-        greatest = max(abs(self.low), abs(self.high))
-        if self.unit not in _PREFIXED or greatest == 0:
-            return 1.0, self.unit
-        fitting = [pair for pair in _PREFIXES if greatest >= pair[0]]
-        factor, prefix = fitting[0] if fitting else _PREFIXES[-1]
-        return factor, prefix + self.unit
+        return prefixed(max(abs(self.low), abs(self.high)), self.unit)
 
     def in_si(self, shown: float) -> float:
         """A number in the shown unit in SI units, without digits from rounding."""
         factor = self.shown_unit[0]
         return shown * factor if factor >= 1 else shown / round(1 / factor)
+
+
+def prefixed(greatest: float, unit: str) -> tuple[float, str]:
+    """Factor and name of a unit with the prefix for which a number is between 1 and 1000; units
+    that are not used with prefixes remain."""
+    if unit not in _PREFIXED or greatest == 0:
+        return 1.0, unit
+    fitting = [pair for pair in _PREFIXES if greatest >= pair[0]]
+    factor, prefix = fitting[0] if fitting else _PREFIXES[-1]
+    return factor, prefix + unit
 
 
 def input_sliders(scene: Scene, inputs: np.ndarray, bounds: Any = None) -> list[Slider]:

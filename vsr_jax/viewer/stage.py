@@ -24,7 +24,7 @@ _VIEW = np.array([0.46, -0.80, 0.37])
 _ANGLE, _DISTANCE, _ASIDE = 0.7, 1.8, 0.2
 """Angle of view [rad]; distance of the camera, and how far the controls at the right move what it
 looks at, in extents of the arm."""
-_OPACITY = {"strain": 0.7, "stress": 0.7, "tension": 0.4}
+_OPACITY = {"strain": 0.8, "stress": 0.8, "tension": 0.4}
 _DIMMED, _DISC = 0.15, 0.25
 """Opacity of the wall of a shape that is no equilibrium, and of discs."""
 _THREAD = 4.0
@@ -98,7 +98,7 @@ class Stage:
             parts = [Mesh(wall.vertices[:0], wall.triangles[:0])] * BANDS
         else:
             self._hide("/arm/wall/plain")
-            level = self.scale.levels(tube_values(values)[wall.triangles].mean(axis=1))
+            level = self.scale.levels(tube_values(values))
             parts = bands(wall, level, BANDS)
         for i, (part, color) in enumerate(zip(parts, self.scale.colors(), strict=True)):
             self._mesh(f"/arm/wall/{i}", part, color, opacity)
