@@ -213,11 +213,11 @@ def _slides(page, browser):
     browser.waits_for(
         lambda: page.session.answer.setting.numbers.get("loads[0].force", [0, 0, -1])[2] > 0.0
     )
-    box.fill("40")
-    browser.waits_for(lambda: page.session.answer.setting.numbers["loads[0].force"][2] == 0.04)
+    box.fill("-20")
+    browser.waits_for(lambda: page.session.answer.setting.numbers["loads[0].force"][2] == -0.02)
     _, box = browser.slider("inputs[1] [N]")
-    box.fill("2.5")
-    browser.waits_for(lambda: page.session.answer.setting.inputs[1] == 2.5)
+    box.fill("0.8")
+    browser.waits_for(lambda: page.session.answer.setting.inputs[1] == 0.8)
     browser.waits_for(lambda: np.allclose(browser.tip_said(), expected(page).tip[:3, 3], atol=1e-4))
     drawn_axis(page)
     for choice, label in (("stress", "von Mises stress"), ("tension", "thread tension")):
@@ -258,7 +258,7 @@ def _saves(page, browser):
         browser.tab.get_by_role("button", name="Scene (TOML)").click()
     saved = parse_scene(pathlib.Path(waiting.value.path()).read_text())
     np.testing.assert_allclose(saved.inputs, page.session.answer.setting.inputs, rtol=1e-12)
-    np.testing.assert_allclose(saved.scene.loads[0].force, [0, 0, 0.04], atol=1e-12)
+    np.testing.assert_allclose(saved.scene.loads[0].force, [0, 0, -0.02], atol=1e-12)
     with browser.tab.expect_download() as waiting:
         browser.tab.get_by_role("button", name="Picture (PNG)").click()
     picture = Image.open(io.BytesIO(pathlib.Path(waiting.value.path()).read_bytes()))

@@ -19,9 +19,11 @@ _FRAME = 0.13
 """Length of the axes of the world's frame, relative to the arm."""
 _GRAVITY = np.array([-0.12, 0.0, 0.12])
 """Where the arrow of gravity starts, relative to the arm."""
+_FLOOR = 1.1
+"""Depth of the floor below the origin, relative to the arm, which does not reach it."""
 _VIEW = np.array([0.46, -0.80, 0.37])
 """Direction from the arm to the camera, that of the figures."""
-_ANGLE, _DISTANCE, _ASIDE = 0.7, 1.8, 0.2
+_ANGLE, _DISTANCE, _ASIDE = 0.7, 1.9, 0.25
 """Angle of view [rad]; distance of the camera, and how far the controls at the right move what it
 looks at, in extents of the arm."""
 _OPACITY = {"strain": 0.8, "stress": 0.8, "tension": 0.4}
@@ -141,14 +143,15 @@ class Stage:
             )
         self._server.scene.add_grid(
             "/world/ground",
-            width=2 * self._length,
-            height=2 * self._length,
+            width=3 * self._length,
+            height=3 * self._length,
             cell_size=self._length / 10,
             section_size=self._length / 2,
             cell_color=self._gray(0.12),
             section_color=self._gray(0.25),
             cell_thickness=0.6,
             section_thickness=0.8,
+            position=(0.0, 0.0, -_FLOOR * self._length),
         )
 
     def _gravity(self, acceleration: np.ndarray) -> None:
@@ -170,7 +173,7 @@ class Stage:
         around = self._length * np.stack([1.2 * _FRAME * np.ones(3), np.zeros(3), _GRAVITY])
         points = np.concatenate([shape.body.points, around])
         low, high = points.min(axis=0), points.max(axis=0)
-        extent = float(np.max(high - low))
+        extent = max(float(np.max(high - low)), self._length)
         right = np.cross((0.0, 0.0, 1.0), _VIEW)
         middle = (low + high) / 2 + _ASIDE * extent * right / np.linalg.norm(right)
         camera = self._server.initial_camera
