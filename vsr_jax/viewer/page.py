@@ -95,10 +95,14 @@ def view(
     print(f"vsr_jax view: {shown.url} (Ctrl-C to end)", file=sys.stderr)
     if browser:
         webbrowser.open(shown.url)
-    interactive = hasattr(sys, "ps1") or "IPython" in sys.modules
-    if not interactive if block is None else block:
+    if not _is_interactive() if block is None else block:
         shown.wait()
     return shown
+
+
+def _is_interactive() -> bool:
+    ipython = sys.modules.get("IPython")
+    return hasattr(sys, "ps1") or (ipython is not None and ipython.get_ipython() is not None)
 
 
 def viewer_library() -> Any:
@@ -147,7 +151,8 @@ class View:
     @property
     def url(self) -> str:
         """Address of the page."""
-        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+        host = self.server.get_host()
+        return f"http://{'localhost' if host == '0.0.0.0' else host}:{self.server.get_port()}"
 
     def wait(self) -> None:
         """Waits until Ctrl-C, or until the view is closed."""
@@ -163,7 +168,8 @@ class View:
             self._ended.set()
             self._player.pause()
             self._worker.close()
-            self.server.stop()
+            with contextlib.redirect_stdout(io.StringIO()):
+                self.server.stop()
 
     def __enter__(self) -> "View":
         return self
@@ -185,7 +191,8 @@ class View:
         """Moves sliders, given by their names in SI units, as a user does; the event is set when
         the answer is drawn."""
         self._player.pause()
-        return self._worker.post("move", lambda: self.show(self.session.move(values)))
+        self._pending.update(values)
+        return self._worker.post("move", lambda: self._answer_moves(slid=False))
 
     def drag(self, target: np.ndarray) -> threading.Event:
         """Drags the tip to a position [m], as a user does; the event is set when the answer is
@@ -216,13 +223,13 @@ class View:
     def _slide(self, name: str) -> None:
         self._player.pause()
         self._pending[name] = self._panel.value(name)
-        self._worker.post("slide", self._answer_slides)
+        self._worker.post("slide", lambda: self._answer_moves(slid=True))
 
-    def _answer_slides(self) -> None:
+    def _answer_moves(self, *, slid: bool) -> None:
         values: dict[str, float] = {}
         while self._pending:
             values.update([self._pending.popitem()])
-        self.show(self.session.move(values), slid=True)
+        self.show(self.session.move(values), slid=slid)
 
     def _dragged(self, event: Any) -> None:
         if event.phase == "end":
@@ -232,7 +239,7 @@ class View:
 
     def _reset(self) -> None:
         self._player.pause()
-        self._worker.post("move", lambda: self.show(self.session.solve(self._initial)))
+        self._worker.post("reset", lambda: self.show(self.session.solve(self._initial)))
 
     def _redraw(self) -> None:
         self._worker.post("redraw", lambda: self.show(self.session.answer))

@@ -31,7 +31,7 @@ class Player:
         self._panel, self._worker, self._session, self._show = panel, worker, session, show
         self._given = {track.name: track for track in tracks}
         self._track: Track | None = None
-        self._playing = threading.Event()
+        self._run_now: object | None = None  # what the thread that plays was started with
         panel.on(panel.track, lambda event: self._forget())
         panel.on(panel.of, lambda event: self._forget())
         panel.on(panel.frame, lambda event: self._seek())
@@ -39,7 +39,7 @@ class Player:
 
     def pause(self) -> None:
         """Stops playing. The track remains."""
-        self._playing.clear()
+        self._run_now = None
         self._panel.play.label = "Play"
 
     def _forget(self) -> None:
@@ -52,14 +52,14 @@ class Player:
         self._worker.post("frame", self._show_frame)
 
     def _toggle(self) -> None:
-        if self._playing.is_set():
+        if self._run_now is not None:
             self.pause()
             return
-        self._playing.set()
+        self._run_now = run = object()
         self._panel.play.label = "Pause"
-        threading.Thread(target=self._run, name="vsr_jax play", daemon=True).start()
+        threading.Thread(target=self._run, args=(run,), name="vsr_jax play", daemon=True).start()
 
-    def _run(self) -> None:
+    def _run(self, run: object) -> None:
         self._worker.post("track", self._load).wait()
         if self._track is None:
             self.pause()
@@ -68,7 +68,7 @@ class Player:
         at = int(self._panel.frame.value)
         frames = range(at if at < last else 0, last + 1)
         for i in frames:
-            if not self._playing.is_set():
+            if self._run_now is not run:
                 return
             begun = time.perf_counter()
             self._panel.frame.value = i
