@@ -4,6 +4,9 @@ import threading
 import traceback
 from collections.abc import Callable
 
+_PATIENCE = 5.0
+"""Seconds to wait for the job that runs when the worker is closed."""
+
 
 class Worker:
     """Runs jobs one after another. A job that has to wait is replaced by a newer one of its kind:
@@ -25,12 +28,12 @@ class Worker:
         return done
 
     def close(self) -> None:
-        """Ends after the job that runs."""
+        """Ends after the job that runs, without waiting for one that compiles for long."""
         with self._changed:
             self._open = False
             self._changed.notify()
         if threading.current_thread() is not self._thread:
-            self._thread.join()
+            self._thread.join(_PATIENCE)
 
     def _work(self) -> None:
         while True:
