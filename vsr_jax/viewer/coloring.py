@@ -86,7 +86,7 @@ class Scale:
         stops = ", ".join(to_hex(self.coloring.map(x)) for x in np.linspace(0, 1, 9))
         factor, unit = prefixed(self.high, self.coloring.unit)
         ends = [
-            f"{round(x / factor, 6):.3g} {unit} {meaning}".strip()
+            " ".join(filter(None, (f"{x / factor:.3g}", unit, meaning)))
             for x, meaning in zip((self.low, self.high), self.coloring.ends, strict=True)
         ]
         return (

@@ -22,6 +22,8 @@ _PREFIXED = ("m", "Pa", "N", "N m")
 _PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "u"))
 _BEND = 2.0
 """Angle [rad] by which a default range of inputs bends an arm that has none."""
+_STRETCH = 0.05
+"""Share of its length by which a default range of inputs stretches an arm at most."""
 _HALVINGS = 8
 """Bisections by which a default range is shortened to numbers that the scene may have."""
 
@@ -179,17 +181,21 @@ def _default_bounds(scene: Scene, inputs: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _visible_input(scene: Scene, actuator: Actuator) -> float:
-    """An input that bends the arm alone by `_BEND`, or stretches it by a twentieth."""
+    """An input that bends the arm alone by `_BEND`, or stretches it by `_STRETCH`."""
     rod = scene.rod
     middle = rod.length / 2
     start = 0.0 if actuator.start is None else actuator.start
     y, z = (float(x) for x in actuator.routing(jnp.asarray(start, rod.length.dtype)))
     lever = float(np.hypot(y, z))
-    length, bending = float(rod.length), max(float(x) for x in rod.stiffness(middle)[1:3])
-    if actuator.length_driven:
-        return _BEND * max(lever, 0.01 * length)
-    stretching = 0.05 * float(rod.stiffness(middle)[3])
-    force = stretching if lever == 0 else min(_BEND * bending / (length * lever), stretching)
+    length = float(rod.length)
+    stiffness = [float(x) for x in rod.stiffness(middle)]
+    bending, stretching = max(stiffness[1:3]), stiffness[3]
+    force = _STRETCH * stretching
+    if lever > 0:
+        force = min(_BEND * bending / (length * lever), force)
+    if actuator.length_driven:  # by bending and by stretching
+        bent = force * length * lever / bending
+        return float(f"{bent * lever + force * length / stretching:.2g}")
     area = actuator.pressure_area
     return float(f"{force if area is None else force / float(area):.2g}")
 
