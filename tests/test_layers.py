@@ -23,6 +23,7 @@ PACKAGES = (
     "optimization",
     "calibration",
     "viz",
+    "viewer",
     "studies",
     "cli",
 )
@@ -101,7 +102,17 @@ def test_the_face_lists_what_it_has():
 
 
 def test_the_face_imports_no_optimiser_ode_solver_or_picture():
-    heavy = ("matplotlib", "diffrax", "optax", "optimistix", "zarr", "xarray", "trimesh", "ezdxf")
+    heavy = (
+        "matplotlib",
+        "diffrax",
+        "optax",
+        "optimistix",
+        "zarr",
+        "xarray",
+        "trimesh",
+        "ezdxf",
+        "viser",
+    )
     code = f"import sys, vsr_jax; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -102,6 +102,7 @@ if TYPE_CHECKING:
     from .optimization.design_search import Design, design
     from .optimization.search import Search
     from .solution import Energy, Equilibrium, Error, Plan, SolveError, Summary, plan, solve
+    from .viewer.page import View, view
     from .viz import annotate, plot, plot_design, plot_fit
     from .viz.animation import film
 
@@ -180,6 +181,7 @@ __all__ = [
     "TipWrench",
     "Trigonometric",
     "Unknown",
+    "View",
     "actuation_matrix",
     "annotate",
     "check",
@@ -215,6 +217,7 @@ __all__ = [
     "stiffness_matrix",
     "sweep",
     "tip_jacobian",
+    "view",
     "zanna_step",
 ]
 
@@ -237,6 +240,7 @@ _LATER = {
     "Design": "optimization.design_search",
     "Fabrication": "fabrication",
     "Search": "optimization.search",
+    "View": "viewer.page",
     "annotate": "viz.annotate",
     "design": "optimization.design_search",
     "export": "fabrication",
@@ -244,6 +248,7 @@ _LATER = {
     "plot": "viz.plot",
     "plot_design": "viz.plot_design",
     "plot_fit": "viz.plot_fit",
+    "view": "viewer.page",
 }
 """Modules of the names that only some programs need: diffrax, optax and matplotlib take longer to
 import than all the rest."""

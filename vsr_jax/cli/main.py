@@ -51,6 +51,11 @@ COMMANDS = {
         "calibrate a scene with measured shapes",
         "vsr-jax fit fit.toml --out calibrated.toml",
     ),
+    "view": Command(
+        "view_commands",
+        "turn the arm of a scene file by hand in the browser",
+        "vsr-jax view scene.toml --number rod.material.young",
+    ),
     "export": Command(
         "fabrication_commands",
         "write files for the workshop: body, threads, holes, lengths",

@@ -41,7 +41,7 @@ class Checkpoint:
         middle = jax.tree.map(lambda low, high: 0.5 * (low + high), problem.low, problem.high)
         rule = fingerprint(first_update, (optimizer, middle))
         self._digest = fingerprint(
-            problem.terms, (middle,), problem.low, problem.high, rule, settings
+            problem.terms, (middle,), problem.low, problem.high, rule, settings, History._fields
         )
 
     def read(self, states: DescentState) -> tuple[DescentState, History]:
@@ -49,10 +49,8 @@ class Checkpoint:
 
         **Raises:** `ValueError` for a file of another computation.
         """
-        starts = states.best.objective.shape[0]
-        none = np.zeros((0, starts), states.best.objective.dtype)
         if self._path is None or not self._path.exists():
-            return states, History(none, none)
+            return states, _empty(states, 0)
         with self._path.open("rb") as file:
             header = _header(file.readline())
             if header.get("design") != self._digest:
@@ -60,8 +58,7 @@ class Checkpoint:
                     f"design.out: {self._path} belongs to another computation, need another file "
                     f"or the same call"
                 )
-            like = np.zeros((header["steps"], starts), none.dtype)
-            return eqx.tree_deserialise_leaves(file, (states, History(like, like)))
+            return eqx.tree_deserialise_leaves(file, (states, _empty(states, header["steps"])))
 
     def write(self, states: DescentState, history: History) -> None:
         """Replaces the file atomically."""
@@ -71,6 +68,14 @@ class Checkpoint:
         with replacing(self._path) as part, part.open("wb") as file:
             file.write(json.dumps(header).encode() + b"\n")
             eqx.tree_serialise_leaves(file, (jax.tree.map(jnp.asarray, states), history))
+
+
+def _empty(states: DescentState, steps: int) -> History:
+    """A history of zeros for a number of steps."""
+    values = np.zeros((steps, *states.best.objective.shape), states.best.objective.dtype)
+    return History(
+        values, values, {name: np.zeros((steps, *z.shape), z.dtype) for name, z in states.z.items()}
+    )
 
 
 def _header(line: bytes) -> dict[str, Any]:

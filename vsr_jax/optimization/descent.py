@@ -88,11 +88,12 @@ class DescentState(NamedTuple):
 
 
 class History(NamedTuple):
-    """Objective and largest violation at each step of each start, shape (steps, starts); NaN where
-    there was no equilibrium."""
+    """Objective and largest violation at each step of each start, shape (steps, starts), NaN where
+    there was no equilibrium; and the free numbers there by name, shape (steps, starts, ...)."""
 
     objective: np.ndarray
     violation: np.ndarray
+    numbers: dict[str, np.ndarray] = {}
 
 
 @lru_cache

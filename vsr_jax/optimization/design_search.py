@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import optax
 from jax.typing import ArrayLike
@@ -63,7 +64,7 @@ class Design(NamedTuple):
     - `margins`: least margin of each constraint by name, dimensionless, negative if violated.
     - `free`: names of the free numbers.
     - `starts`: the best of each start, in order, and `best`, the index of the best of them.
-    - `history`: objective and violation of each start at each step.
+    - `history`: objective, violation and free numbers of each start at each step.
     """
 
     scene: Scene
@@ -196,15 +197,14 @@ def _run(
     while not search.finished(history):
         first, rows = len(history.objective), []
         for done in range(first, min(first + _CHUNK, search.steps)):
+            point = states.z
             states, row = descend(problem, rule, states, penalty_weight(done, search.steps))
             bar.set_description("designing", refresh=done == first)  # compiled by the first step
-            rows.append(row)
-        history = History(
-            *(
-                np.concatenate([old, np.stack(new)])
-                for old, new in zip(history, zip(*rows, strict=True), strict=True)
-            )
-        )
+            rows.append((*row, point))
+        objective, violation, points = jax.tree.map(lambda *x: np.stack(x), *rows)
+        numbers = problem.at(jax.tree.map(jnp.asarray, points))
+        new = History(objective, violation, jax.tree.map(np.asarray, numbers))
+        history = jax.tree.map(lambda old, more: np.concatenate([old, more]), history, new)
         checkpoint.write(states, history)
         best = best_start(states.best)
         feasible = int(np.sum(np.asarray(states.best.violation) <= 0))

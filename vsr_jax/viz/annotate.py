@@ -1,6 +1,7 @@
 """Annotations of an arm in 3D, drawn after `plot.arm`: frames of sections, arrows of loads,
 ellipsoids of the tip."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -14,6 +15,7 @@ from ..analysis.derivatives import Ellipsoid
 from ..arm.loads import Load
 from ..arm.pose_loads import PoseLoad
 from ..arm.rod import Rod
+from ..arm.scene import Scene
 from ..solution.equilibrium import Equilibrium
 from ..validation import instance
 from .space import FRAME_COLORS, checked_space, equal_scale
@@ -109,36 +111,51 @@ class Row(NamedTuple):
 
 def rows_of(eq: Equilibrium) -> list[Row]:
     """Forces and moments of the loads of an equilibrium, without those that are zero."""
+    return rows_from_wrenches(eq.scene, wrenches_of(eq))
+
+
+Acting = tuple[Array, Array]
+"""Poses of the sections on which a load acts, shape (places, 4, 4), and its moment [N m] and force
+[N] there in the world's axes, shape (places, 6); per length for a load along the arm."""
+
+
+def wrenches_of(eq: Equilibrium) -> list[Acting]:
+    """Where and how each load of an equilibrium acts; `jax.jit` goes through it."""
     rod, loads = eq.scene.rod, eq.scene.loads
     if not loads:
         return []
-    along = jnp.linspace(0, rod.length, _STATIONS)
+    along = jnp.linspace(0, 1, _STATIONS) * rod.length
     X = [along if (x := load.place(rod)) is None else x[None] for load in loads]
     ends = np.cumsum([x.size for x in X])[:-1]
-    poses = np.split(np.asarray(eq.pose(jnp.concatenate(X))), ends)
-    rows = []
-    for load, x, pose in zip(loads, X, poses, strict=True):
-        per_length = "" if load.place(rod) is not None else "/m"
-        wrench = _wrench(load, rod, x, pose)
+    poses = jnp.split(eq.pose(jnp.concatenate(X)), ends)
+    return [
+        (pose, _wrench(load, rod, x, pose)) for load, x, pose in zip(loads, X, poses, strict=True)
+    ]
+
+
+def rows_from_wrenches(scene: Scene, wrenches: Sequence[Acting]) -> list[Row]:
+    """The loads of a scene from their `wrenches_of`, without those that are zero."""
+    found = []
+    for load, (pose, wrench) in zip(scene.loads, jax.tree.map(np.asarray, wrenches), strict=True):
+        per_length = "" if load.place(scene.rod) is not None else "/m"
         for unit, vectors in (("N", wrench[:, 3:]), ("N m", wrench[:, :3])):
             row = Row(load.effects[0], unit + per_length, pose[:, :3, 3], vectors)
-            rows += [row] if row.greatest > 0 else []
-    return rows
+            found += [row] if row.greatest > 0 else []
+    return found
 
 
-def _wrench(load: Load, rod: Rod, X: Array, poses: np.ndarray) -> np.ndarray:
+def _wrench(load: Load, rod: Rod, X: Array, poses: Array) -> Array:
     """Moments and forces at abscissas X in the world's axes, shape (X, 6)."""
     if isinstance(load, PoseLoad):
-        posed = jax.vmap(lambda x, g: load.wrench(rod, x, g[:3, :3], g[:3, 3]))
-        return np.asarray(posed(X, jnp.asarray(poses)))
+        return jax.vmap(lambda x, g: load.wrench(rod, x, g[:3, :3], g[:3, 3]))(X, poses)
     point = load.point(rod)
     if point is not None:
-        wrench = np.asarray(jnp.stack(point[1]))[None]
+        wrench = jnp.stack(point[1])[None]
     else:
-        wrench = np.asarray(jax.vmap(lambda x: jnp.stack(load.density(rod, x) or ()))(X))
+        wrench = jax.vmap(lambda x: jnp.stack(load.density(rod, x) or ()))(X)
     if load.frame == "world":
         return wrench
-    return np.einsum("xij,xkj->xki", poses[:, :3, :3], wrench.reshape(-1, 2, 3)).reshape(-1, 6)
+    return jnp.einsum("xij,xkj->xki", poses[:, :3, :3], wrench.reshape(-1, 2, 3)).reshape(-1, 6)
 
 
 def _draw_arrows(ax: Axes3D, row: Row, arrows: np.ndarray, color: ColorType | None) -> None:

@@ -89,7 +89,11 @@ def body_of(eq: Equilibrium | Summary, stations: VectorLike = 60) -> Body:
         return Body(eq, None, None, np.zeros((0, 1, 3)))
     if np.ndim(eq.status) == 0 and not bool(eq.converged):
         return body_of(at_rest(eq), stations)._replace(failure=eq.message)
-    samples = sample(eq, stations)
+    return body_from_samples(eq, sample(eq, stations))
+
+
+def body_from_samples(eq: Equilibrium, samples: Summary) -> Body:
+    """The arm of a converged equilibrium from its `samples`, as `sample` returns them."""
     tension = -np.asarray(samples.values["forces"])
     return Body(samples, tension, is_slack(eq, tension), _discs(eq, samples))
 
