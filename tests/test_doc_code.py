@@ -19,7 +19,12 @@ from vsr_jax.optimization.design_file import load_design
 
 ROOT = pathlib.Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-ELSEWHERE = {DOCS / "extending.md", DOCS / "fabrication.md", DOCS / "files.md"}
+ELSEWHERE = {
+    DOCS / "extending.md",
+    DOCS / "fabrication.md",
+    DOCS / "files.md",
+    DOCS / "live_view.md",
+}
 SLOW = {
     DOCS / "guides" / f"{name}.md" for name in ("catheter", "pneumatic_arm", "calibrate", "design")
 }
