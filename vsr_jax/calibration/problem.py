@@ -1,8 +1,8 @@
 """A fit as a least-squares problem: residuals in standard deviations as a function of the unknowns,
 for all shapes or some of them, with standard deviations that are given or estimated."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any, NamedTuple
 
@@ -53,7 +53,8 @@ class FitProblem:
     """What a fit minimises.
 
     **Fields:** `predictor`, the model of what is measured; `data`; `columns`, the unknowns; `loss`;
-    `steps`, the most that one minimisation takes.
+    `steps`, the most that one minimisation takes; `order`, by the name of unlabelled markers the
+    index of the measured position of each point, shape (shapes, points), once they are assigned.
     """
 
     predictor: Predictor
@@ -61,6 +62,7 @@ class FitProblem:
     columns: tuple[Column, ...]
     loss: str
     steps: int
+    order: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
