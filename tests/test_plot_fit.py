@@ -39,11 +39,12 @@ def test_markers_are_joined_to_their_predictions(fit):
     plane, good = [0, 2], [0, 1, 3]
     seen = np.asarray(fit.problem.data.observations[0].value)
     eqs = [vsr.solve(fit.scene, INPUTS[i], model=MODEL).pose(jnp.array(X)) for i in good]
+    drawn = [np.asarray(line.get_xydata()) for line in ax.lines]
+    lines = [points for points in drawn if len(points) == 2]
     for k, (i, g) in enumerate(zip(good, eqs, strict=True)):
         predicted = g[:, :3, 3] + (g[:, :3, :3] @ jnp.array(OFFSET)[:, :, None])[..., 0]
         for j in (0, 1):
             ends = np.stack([seen[i, j], predicted[j]])[:, plane]
-            lines = [line.get_xydata() for line in ax.lines if len(line.get_xydata()) == 2]
             np.testing.assert_allclose(lines[2 * k + j], ends, atol=1e-6)
     plt.close("all")
 
@@ -51,11 +52,13 @@ def test_markers_are_joined_to_their_predictions(fit):
 def test_a_failed_shape_is_said_to_be(fit):
     assert fit.failed == (CRUSHED,)
     ax = vsr.plot_fit.shapes(fit, axes="xz")
-    texts = [text.get_text() for text in ax.get_legend().get_texts()]
+    legend = ax.get_legend()
+    assert legend is not None
+    texts = [text.get_text() for text in legend.get_texts()]
     assert texts == ["fitted", "no equilibrium: 2", "measured", "predicted"]
     crosses = [line for line in ax.lines if line.get_marker() == "x"]
     seen = np.asarray(fit.problem.data.observations[0].value)[CRUSHED][:, [0, 2]]
-    np.testing.assert_allclose(crosses[0].get_xydata()[:2], seen)
+    np.testing.assert_allclose(np.asarray(crosses[0].get_xydata())[:2], seen)
     # its arm is not drawn
-    assert sum(len(line.get_xydata()) == 41 for line in ax.lines) == 3
+    assert sum(len(np.asarray(line.get_xydata())) == 41 for line in ax.lines) == 3
     plt.close("all")

@@ -40,13 +40,13 @@ def adjusted(
     if not any(_unlabelled(one) for one in problem.data.observations):
         return problem, problem.adjust(start, sd=sd, report=report)
     problem, outcome = _assigned(problem, start, None)
+    found = problem.adjust(start, sd=sd, guess=outcome, report=report)
     for _ in range(_ROUNDS):
-        found = problem.adjust(start, sd=sd, guess=outcome, report=report)
-        start, outcome = found.x, found.outcome
-        after, _ = _assigned(problem, start, outcome)
+        after, _ = _assigned(problem, found.x, found.outcome)
         if all(np.array_equal(after.order[name], old) for name, old in problem.order.items()):
             return problem, found
         problem = after
+        found = problem.adjust(found.x, sd=sd, guess=found.outcome, report=report)
     ended = found.minimum._replace(converged=False, reason="markers keep changing their points")
     return problem, found._replace(minimum=ended)
 

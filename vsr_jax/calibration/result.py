@@ -224,6 +224,18 @@ class Fit:
         assert axis.X is not None
         return Prediction(axis.X, found.residual.reshape(shape), np.sqrt(variance).reshape(shape))
 
+    def cost(self, x: VectorLike) -> float:
+        """What the fit minimises, at other values of the unknowns (in the order of `names`): minus
+        the logarithm of the posterior density up to a constant. For optimisers and samplers of your
+        own; without derivatives. Infinite beyond the bounds, and where a shape that counts in the
+        fit has no equilibrium.
+
+        **Raises:** `ValueError` for another number of unknowns.
+        """
+        return self.problem.cost(
+            np.asarray(numbers("x", x, (len(self.names),)), float), self.adjusted
+        )
+
     def refit(
         self,
         fixed: Mapping[str, float] | None = None,
