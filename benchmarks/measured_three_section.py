@@ -232,7 +232,7 @@ def plotted(fit: vsr.Fit, test: vsr.Fit, recording: Recording, file: str) -> Non
         axes[0].plot(*seen[here].T[:2], ".", color=color, markersize=4, label=f"{name}, measured")
         axes[0].plot(*found[here].T[:2], "x", color=color, markersize=4, label="predicted")
     axes[0].set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal", title="Last fifth, held out")
-    axes[0].legend(frameon=False, fontsize=8)
+    axes[0].legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     begin = recording.time[0]
     pairs = ((fit, recording.train(TRAIN), "fitted"), (test, index, "held out"))
     for one, rows, name in pairs:
