@@ -14,6 +14,7 @@ from tqdm import tqdm
 from ..arm.scene import Scene
 from ..models.base import Model
 from ..validation import choice, count, instance
+from .assignment import adjusted
 from .least_squares import LOSSES
 from .measurements import Measurements
 from .problem import Adjusted, FitProblem, formulate
@@ -62,8 +63,9 @@ def fit(
     - `steps`: most steps of one minimisation.
     - `progress`: whether to show a progress bar.
 
-    Shapes without an equilibrium do not count; they are named in the result, and no step gives up a
-    shape that had one. Where an observation has no `sd`, it is estimated from the residuals, so
+    Shapes without an equilibrium, or at which a measured number has no derivatives, do not count:
+    they are named in the result and tried again at every step; no step gives up a shape that
+    counts. Where an observation has no `sd`, it is estimated from the residuals, so
     that $\\chi^2$ equals the degrees of freedom.
 
     **Returns:** a `Fit`.
@@ -89,7 +91,7 @@ def _starts(problem: FitProblem, number: int, seed: int) -> list[np.ndarray]:
 
 
 def _best(problem: FitProblem, starts: list[np.ndarray], progress: bool) -> Fit:
-    found: list[Adjusted] = []
+    found: list[tuple[FitProblem, Adjusted]] = []
     with tqdm(unit=" steps", disable=not progress) as bar:
 
         def report(step: int, cost: float) -> None:
@@ -98,16 +100,16 @@ def _best(problem: FitProblem, starts: list[np.ndarray], progress: bool) -> Fit:
 
         sd = None
         for start in starts:
-            one = problem.adjust(start, sd=sd, report=report)
-            found.append(one)
+            found.append(adjusted(problem, start, sd=sd, report=report))
             # costs compare for the same standard deviations only
-            sd = one.sd if sd is None else sd
-    solved = [int(np.sum(one.minimum.residuals.solved)) for one in found]
+            sd = found[-1][1].sd if sd is None else sd
+    minima = [one.minimum for _, one in found]
+    solved = [int(np.sum(one.residuals.solved)) for one in minima]
     if not max(solved):
         raise ValueError(
             f"fit: got no equilibrium for any of the {len(problem.data)} shapes, need bounds and a "
             f"scene that can be solved for these inputs"
         )
-    best = min(range(len(found)), key=lambda i: (-solved[i], found[i].minimum.cost))
-    chosen = found[best] if best == 0 else problem.adjust(found[best].x)
-    return Fit(problem, chosen, tuple(one.minimum.cost for one in found))
+    best = min(range(len(found)), key=lambda i: (-solved[i], minima[i].cost))
+    chosen = found[best] if best == 0 else adjusted(found[best][0], minima[best].x)
+    return Fit(*chosen, tuple(one.cost for one in minima))

@@ -26,7 +26,7 @@ from ..arm.rod import Rod
 from ..numerics.se3 import rotation_vector
 from ..solution.equilibrium import Equilibrium
 from ..typing import ArrayLike, MatrixLike
-from ..validation import numbers, on_arm, rigid
+from ..validation import instance, numbers, on_arm, rigid
 
 
 class Observation(eqx.Module):
@@ -136,9 +136,14 @@ class Markers(Observation):
       shape (4, 4); the world's frame by default.
     - `labels`: name of each point.
     - `name`: first part of the names of its numbers, as in `"markers.offset"`.
+    - `labelled`: whether the positions of each shape are in the order of `X`. If not, a fit assigns
+      them to the points, those of a shape all together: alternately each position to a point by the
+      present unknowns, and the unknowns by least squares. Which is which depends on the start, so
+      it should be nearer than half the distance of two markers, or there should be several.
+      Positions that are missing go anywhere in the list. Needs SciPy.
 
-    **Raises:** `ValueError` for wrong shapes, an `sd` that is not positive, and a `frame` that is
-    not a rigid transform.
+    **Raises:** `ValueError` for wrong shapes, an `sd` that is not positive, a `frame` that is not a
+    rigid transform, and unlabelled positions of which a coordinate is missing.
     """
 
     value: Float[Array, "..."]
@@ -146,6 +151,7 @@ class Markers(Observation):
     X: Float[Array, " points"] | None = eqx.field(metadata={"unit": "m"})
     offset: Float[Array, "points 3"] = eqx.field(metadata={"unit": "m"})
     name: str = eqx.field(static=True)
+    labelled: bool = eqx.field(static=True)
     _labels: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(
@@ -158,6 +164,7 @@ class Markers(Observation):
         frame: MatrixLike | None = None,
         labels: Sequence[str] | None = None,
         name: str = "markers",
+        labelled: bool = True,
     ):
         value = _values(f"{name}.position", position, (3,))
         rows = value.shape[1]
@@ -171,6 +178,13 @@ class Markers(Observation):
             value = value @ pose[:3, :3].T + pose[:3, 3]
         self.value, self.sd = value, deviation(f"{name}.sd", sd)
         self.name, self._labels = name, _row_labels(name, labels, rows)
+        self.labelled = instance(f"{name}.labelled", labelled, bool, "True or False")
+        seen = self.present
+        if not labelled and np.any(seen.any(axis=2) != seen.all(axis=2)):
+            raise ValueError(
+                f"{name}.position: got positions without all three coordinates, need none or all "
+                f"of them where labelled=False"
+            )
 
     def predicted(self, eq: Equilibrium) -> Float[Array, "points 3"]:
         g = eq.tip[None] if self.X is None else eq.pose(self.X)

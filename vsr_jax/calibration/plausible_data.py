@@ -26,6 +26,8 @@ def check_positions(scene: Scene, data: Measurements, columns: Sequence[Column])
         X = length if one.X is None else np.asarray(one.X)
         room = _STRETCH * X + np.linalg.norm(np.asarray(one.offset), axis=1)
         room = room + _shift(columns, (POSITION, f"{one.name}.offset"))
+        if not one.labelled:
+            room = np.full_like(room, np.max(room))
         distance = np.linalg.norm(np.asarray(one.value, float) - base, axis=-1)
         if not np.any(distance > room):
             if np.nanmax(distance) < _NEAR * np.max(room):

@@ -2,7 +2,7 @@ r"""Residuals of all shapes and their derivatives by the numbers that a fit chan
 $\partial f_s / \partial p$ from one compiled program, by the implicit derivatives of the equilibria
 in forward mode."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -161,18 +161,51 @@ def linearised(
     **Arguments:** `numbers`, shape (shapes, slots); `guess`: outcomes for numbers near by, from
     which the solves start; `chunk`: shapes that one call of the program solves side by side.
     """
+    found = _in_chunks(_linearised, predictor, numbers, (inputs, values, guess), chunk)
+    residual, slopes, outcome = found
+    return Linearised(residual.astype(float), slopes.astype(float), outcome)
+
+
+def residuals(
+    predictor: Predictor,
+    numbers: np.ndarray,
+    inputs: Float[Array, "shapes actuators"],
+    values: tuple[Array, ...],
+    *,
+    guess: Outcome | None = None,
+    chunk: int = CHUNK,
+) -> tuple[np.ndarray, Outcome]:
+    """Residuals of shapes (shapes, residuals) without derivatives, and the outcomes of the solves;
+    arguments as for `linearised`."""
+    found = _in_chunks(_residuals, predictor, numbers, (inputs, values, guess), chunk)
+    return found[0].astype(float), found[1]
+
+
+def _in_chunks(
+    program: Callable[..., tuple],
+    predictor: Predictor,
+    numbers: np.ndarray,
+    known: tuple[Array, tuple[Array, ...], Outcome | None],
+    chunk: int,
+) -> tuple:
+    """Results of a program for all shapes, on the host."""
+    inputs, values, guess = known
     shapes, parts = len(inputs), []
     guess = predictor.unguessed(inputs) if guess is None else guess
     for first in range(0, shapes, chunk):
         # the last rows are filled up with copies, so that one program serves any number of shapes
         rows = np.minimum(np.arange(first, first + chunk), shapes - 1)
         here = jnp.asarray(numbers[rows], inputs.dtype)
-        known = jax.tree.map(lambda x, rows=rows: x[rows], (inputs, values, guess))
-        parts.append(_linearised(predictor, here, *known))
-    residual, slopes, outcome = jax.tree.map(
+        some = jax.tree.map(lambda x, rows=rows: x[rows], (inputs, values, guess))
+        parts.append(program(predictor, here, *some))
+    return jax.tree.map(
         lambda *pieces: np.concatenate([np.asarray(piece) for piece in pieces])[:shapes], *parts
     )
-    return Linearised(residual.astype(float), slopes.astype(float), outcome)
+
+
+@eqx.filter_jit
+def _residuals(predictor: Predictor, numbers: Array, *known: Any) -> tuple[Array, Outcome]:
+    return jax.vmap(predictor.residual)(numbers, *known)
 
 
 @eqx.filter_jit

@@ -1,8 +1,8 @@
 """A fit as a least-squares problem: residuals in standard deviations as a function of the unknowns,
 for all shapes or some of them, with standard deviations that are given or estimated."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ from ..typing import cast
 from .least_squares import Box, Minimum, Residuals, loss_of, minimise, normal_matrix
 from .measurements import Measurements
 from .plausible_data import check_positions
-from .predictions import CHUNK, Predictor, linearised
+from .predictions import CHUNK, Predictor, linearised, residuals
 from .unknowns import Column, Free, affine, columns_of, slots_of
 
 _ROUNDS = 30
@@ -53,7 +53,8 @@ class FitProblem:
     """What a fit minimises.
 
     **Fields:** `predictor`, the model of what is measured; `data`; `columns`, the unknowns; `loss`;
-    `steps`, the most that one minimisation takes.
+    `steps`, the most that one minimisation takes; `order`, by the name of unlabelled markers the
+    index of the measured position of each point, shape (shapes, points), once they are assigned.
     """
 
     predictor: Predictor
@@ -61,6 +62,7 @@ class FitProblem:
     columns: tuple[Column, ...]
     loss: str
     steps: int
+    order: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -121,6 +123,27 @@ class FitProblem:
         """Residuals of the measured shapes."""
         values = tuple(one.value for one in self.data.observations)
         return self.evaluate(x, self.data.inputs, self.data.series, values, guess)
+
+    def cost(self, x: np.ndarray, near: Adjusted) -> float:
+        """Cost at other values of the unknowns, without derivatives, with the standard deviations
+        of a minimum; infinite beyond the bounds and where a shape that counts there is lost."""
+        if np.any((x < self.box.low) | (x > self.box.high)):
+            return float("inf")
+        data, counts = self.data, near.minimum.residuals.solved
+        b, A = affine(self.columns, self.predictor.slots, np.asarray(data.inputs), data.series)
+        residual, outcome = residuals(
+            self.predictor,
+            b + A @ x,
+            data.inputs,
+            tuple(one.value for one in data.observations),
+            guess=near.outcome,
+            chunk=min(CHUNK, len(data)),
+        )
+        if np.any(counts & (np.asarray(outcome.status) != Status.CONVERGED)):
+            return float("inf")
+        counted = counts[:, None] & data.present
+        half, _, _ = loss_of(self.loss, np.where(counted, residual / near.sd, 0.0))
+        return float(np.sum(half)) + self.box.prior_cost(x)
 
     def adjust(
         self,

@@ -57,7 +57,8 @@ def _warnings(fit: Any) -> list[str]:
     if fit.failed:
         shapes = ", ".join(map(str, fit.failed))
         lines.append(
-            f"FAILED: {len(fit.failed)} shapes have no equilibrium and no weight: {shapes}"
+            f"FAILED: {len(fit.failed)} shapes have no equilibrium (or no derivatives there) "
+            f"and no weight: {shapes}"
         )
     if not fit.converged:
         lines.append(f"NOT CONVERGED: {fit.reason}")

@@ -17,6 +17,7 @@ from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
 from ..typing import ArrayLike, VectorLike, cast
 from ..validation import numbers
+from .assignment import adjusted
 from .measurements import Measurements
 from .observation import Markers
 from .plausible_data import check_positions
@@ -109,7 +110,8 @@ class Fit:
 
     @property
     def failed(self) -> tuple[int, ...]:
-        """Shapes without an equilibrium: they do not count."""
+        """Shapes without an equilibrium, or whose measurements have no derivatives there: they do
+        not count."""
         return tuple(np.flatnonzero(~self.adjusted.minimum.residuals.solved).tolist())
 
     @cached_property
@@ -118,6 +120,12 @@ class Fit:
         there are any, determine them."""
         found = undetermined(self.adjusted.minimum, self.problem.box)
         return tuple(in_words(one, self.names, self.x) for one in found)
+
+    @property
+    def order(self) -> Mapping[str, np.ndarray]:
+        """By the name of unlabelled markers the index of the measured position that each point was
+        assigned to, shape (shapes, points). The data of `problem` are in that order."""
+        return self.problem.order
 
     @property
     def chi_squared(self) -> float:
@@ -216,6 +224,18 @@ class Fit:
         assert axis.X is not None
         return Prediction(axis.X, found.residual.reshape(shape), np.sqrt(variance).reshape(shape))
 
+    def cost(self, x: VectorLike) -> float:
+        """What the fit minimises, at other values of the unknowns (in the order of `names`): minus
+        the logarithm of the posterior density up to a constant. For optimisers and samplers of your
+        own; without derivatives. Infinite beyond the bounds, and where a shape that counts in the
+        fit has no equilibrium.
+
+        **Raises:** `ValueError` for another number of unknowns.
+        """
+        return self.problem.cost(
+            np.asarray(numbers("x", x, (len(self.names),)), float), self.adjusted
+        )
+
     def refit(
         self,
         fixed: Mapping[str, float] | None = None,
@@ -270,8 +290,8 @@ class Fit:
         for row in data.inputs:
             self.problem.predictor.scene.check_inputs(row)
         data = cast(data, self.problem.data.inputs.dtype)
-        problem = replace(self.problem, columns=columns, data=data)
-        return Fit(problem, problem.adjust(problem.start))
+        problem = replace(self.problem, columns=columns, data=data, order={})
+        return Fit(*adjusted(problem, problem.start))
 
     def _affine(self, rows: Array, series: str) -> tuple[np.ndarray, np.ndarray]:
         problem = self.problem

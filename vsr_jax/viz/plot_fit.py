@@ -5,6 +5,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
+from matplotlib.lines import Line2D
 
 from ..calibration.observation import Markers
 from ..calibration.result import Fit
@@ -15,37 +16,84 @@ _LARGEST_CORNER = 6
 """Most unknowns that are drawn in pairs."""
 _TWO_SD = 2.4477
 """Radius of the ellipse that holds 95 % of a normal distribution of two numbers."""
+_MOST_NAMED = 5
+"""Most failed shapes that the legend names."""
 
 
 def shapes(fit: Fit, ax: Axes | None = None, *, axes: str = "xz") -> Axes:
-    """Fitted arms as lines and measured markers as points, in a plane of the world.
+    """Fitted arms as lines, measured markers as points, each joined to where the fit predicts it (a
+    ring), in a plane of the world. Markers of shapes that failed are crosses; the legend names the
+    shapes.
 
     **Arguments:** `axes`: the two axes of the world that are drawn.
 
     **Returns:** the axes.
     """
     ax = plt.subplots(layout="constrained")[1] if ax is None else ax
-    i, j = ("xyz".index(letter) for letter in axes)
-    data, problem = fit.problem.data, fit.problem
-    X = np.linspace(0, float(problem.predictor.scene.rod.length), 41)
-    for g, group in enumerate(data.groups):
-        rows = np.array([one == group for one in data.series])
-        scene, color = fit.scene_of(group), COLORS[g % len(COLORS)]
-        inputs = fit.inputs(data.inputs[rows])
-        model = problem.predictor.model
-        places = jax.vmap(
-            lambda u, scene=scene, model=model: solve(scene, u, model=model).position(X)
-        )(inputs)
-        for k, place in enumerate(np.asarray(places)):
+    plane = ["xyz".index(letter) for letter in axes]
+    groups = fit.problem.data.groups
+    for g, group in enumerate(groups):
+        rows = np.array([one == group for one in fit.problem.data.series])
+        rows[list(fit.failed)] = False
+        color = COLORS[g % len(COLORS)]
+        for k, place in enumerate(_axis(fit, group, rows)[..., plane]):
             label = (group or "fitted") if k == 0 else None
-            ax.plot(place[:, i], place[:, j], color=color, linewidth=0.9, label=label)
-        for one in data.observations:
+            ax.plot(*place.T, color=color, linewidth=0.9, label=label)
+        for one in fit.problem.data.observations:
             if isinstance(one, Markers):
-                seen = np.asarray(one.value)[rows].reshape(-1, 3)
-                ax.plot(seen[:, i], seen[:, j], ".", color=color, markersize=4)
+                _markers(fit, one, rows, ax, plane, color)
+    _failed(fit, ax, plane)
+    _legend(ax)
     ax.set(xlabel=f"{axes[0]} [m]", ylabel=f"{axes[1]} [m]", aspect="equal")
-    ax.legend(frameon=False)
     return ax
+
+
+def _axis(fit: Fit, group: str, rows: np.ndarray) -> np.ndarray:
+    """Positions on the axis of the fitted arms of some shapes, shape (shapes, stations, 3)."""
+    scene, model = fit.scene_of(group), fit.problem.predictor.model
+    X = np.linspace(0, float(scene.rod.length), 41)
+    if not rows.any():
+        return np.zeros((0, X.size, 3))
+    inputs = fit.inputs(fit.problem.data.inputs[rows])
+    return np.asarray(jax.vmap(lambda u: solve(scene, u, model=model).position(X))(inputs))
+
+
+def _markers(
+    fit: Fit, one: Markers, rows: np.ndarray, ax: Axes, plane: list[int], color: str
+) -> None:
+    """Measured and predicted positions of some shapes."""
+    seen = np.asarray(one.value, float)[rows]
+    gap = np.stack([fit.residuals[label][rows] for label in one.labels], axis=1)
+    ends = np.stack([seen, seen + gap]).reshape(2, -1, 3)[..., plane]
+    ax.plot(ends[..., 0], ends[..., 1], color=color, linewidth=0.5)
+    ax.plot(*ends[0].T, ".", color=color, markersize=4)
+    ax.plot(*ends[1].T, "o", color=color, markersize=4, fillstyle="none", markeredgewidth=0.6)
+
+
+def _failed(fit: Fit, ax: Axes, plane: list[int]) -> None:
+    """Markers of the shapes that failed, with their numbers in the legend."""
+    failed = list(fit.failed)
+    if not failed:
+        return
+    some = ", ".join(map(str, failed[:_MOST_NAMED]))
+    more = f" and {len(failed) - _MOST_NAMED} more" if len(failed) > _MOST_NAMED else ""
+    seen = [
+        np.asarray(one.value, float)[failed].reshape(-1, 3)
+        for one in fit.problem.data.observations
+        if isinstance(one, Markers)
+    ]
+    places = np.concatenate([*seen, np.full((1, 3), np.nan)])[:, plane]
+    ax.plot(*places.T, "x", color="0.4", markersize=5, label=f"no equilibrium: {some}{more}")
+
+
+def _legend(ax: Axes) -> None:
+    """Series and failed shapes, and what the two kinds of points are."""
+    style = {"color": "0.4", "linestyle": "none", "markersize": 4}
+    points = [
+        Line2D([], [], marker=".", label="measured", **style),
+        Line2D([], [], marker="o", fillstyle="none", label="predicted", **style),
+    ]
+    ax.legend(handles=[*ax.get_legend_handles_labels()[0], *points], frameon=False, fontsize=8)
 
 
 def residuals(fit: Fit, ax: Axes | None = None) -> Axes:
