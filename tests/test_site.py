@@ -104,6 +104,13 @@ def test_the_distances_of_other_tools_are_those_of_the_record():
     assert f"{two_digits(theirs)} m and {two_digits(scipy)} m" in read(DOCS / "validation.md")
 
 
+def test_the_distances_to_sorosim_are_those_of_the_record():
+    rows = json.loads(read(RESULTS / "sorosim_statics.json"))
+    for name in ("steel", "tpu"):
+        texts = [f"{1e3 * x:.2f}" for key, x in rows[name].items() if key.endswith("[m]")]
+        assert "| {} | {} | {}, {} |".format(*texts) in read(DOCS / "validation.md")
+
+
 def test_the_errors_of_the_measured_tentacle_are_those_of_the_record():
     models = json.loads(read(RESULTS / "measured_tentacle.json"))["models"]
     text = " ".join(read(DOCS / "validation.md").split())
