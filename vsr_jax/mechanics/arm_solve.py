@@ -12,8 +12,9 @@ from jaxtyping import Array
 from ..numerics import component as c
 from ..numerics.batching import arms_in, side_by_side
 from ..numerics.component import Vector
+from ..numerics.damped_newton import LOAD_INCREMENTS, MAX_TURN, Damped, Measures, damped_newton
 from ..numerics.implicit import implicit_root
-from ..numerics.newton import LOAD_INCREMENTS, MAX_TURN, Damped, Measures, Root, damped_newton
+from ..numerics.newton import Root
 from ..typing import cast
 from .arm_balance import ArmImbalance, ArmUnknown, imbalance_of, rounding_of, state_of
 from .arm_tangent import approximate_solve, tangent_solve
@@ -140,9 +141,9 @@ class _Sizes(NamedTuple):
 
     def dot(self, one: ArmUnknown, other: ArmUnknown) -> Array:
         """Scalar product of two steps by their elastic energy, in single precision."""
-        stiffness, weight = self.problem.sections.stiffness, self.problem.grid.weight
+        stiffness, weight = c.single((self.problem.sections.stiffness, self.problem.grid.weight))
         terms = (s * x * y for s, x, y in zip(stiffness, one.xi, other.xi, strict=True))
-        total = jnp.sum(c.single(weight) * sum(c.single(tuple(terms))), axis=(0, 1))
+        total = jnp.sum(weight * sum(terms), axis=(0, 1))
         return total.astype(self.problem.grid.h.dtype)
 
     def _inner(self, x: Array) -> tuple[int, ...]:

@@ -22,8 +22,9 @@ from ..mechanics.reaction import reaction_change, slopes_of
 from ..numerics import component as c, lu
 from ..numerics.batching import arms_in, side_by_side
 from ..numerics.component import Vector
+from ..numerics.damped_newton import LOAD_INCREMENTS, MAX_TURN, Damped, Measures, damped_newton
 from ..numerics.implicit import implicit_root
-from ..numerics.newton import LOAD_INCREMENTS, MAX_TURN, Damped, Measures, Root, damped_newton
+from ..numerics.newton import Root
 from ..numerics.quadrature import Grid
 from ..numerics.stacked import components, stack
 
