@@ -84,6 +84,7 @@ def reached(scene, target, **options):
     return vsr.reach(scene, target, (0.0, 12.0), model=vsr.StrainDependent(4), **options)
 
 
+@pytest.mark.slow
 def test_reach_says_that_it_compiles_but_not_the_second_time(monkeypatch, capsys):
     monkeypatch.setattr(progress, "SILENT", 0.0)
     arm = vsr.Rod(0.3, vsr.Circular(0.01), vsr.Material(8e5, poisson=0.45))

@@ -93,6 +93,7 @@ def test_far_from_a_reversal_it_is_the_law_of_releasing():
     np.testing.assert_allclose(found, released.tip[:3, 3], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_path_continues_in_parts():
     scene = soft(loads=[vsr.Gravity((0.0, 0.0, -2.0))])
     tensions = [1.0, 5.0, 3.0, 2.0, 4.0]
@@ -102,6 +103,7 @@ def test_a_path_continues_in_parts():
     np.testing.assert_allclose(tips(scene, tensions[3:], start=last), whole[3:], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_gradients_by_the_past_and_by_the_friction():
     """Of a sample whose cable partly sticks: against differences, in both modes."""
     scene = soft()
@@ -135,6 +137,7 @@ def test_lengths_with_friction():
     np.testing.assert_allclose(tension[4], tension[1], rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_paths_batch_and_in_single_precision():
     scene = soft()
     paths = jnp.array([[1.0, 4.0, 2.0], [3.0, 1.0, 2.0]])[..., None]
