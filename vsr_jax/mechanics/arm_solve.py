@@ -211,6 +211,6 @@ def _solve(
     shares = 1 if whole.loads is None else LOAD_INCREMENTS
     floor = jnp.broadcast_to(rounding_of(whole), arms)
     again = None if guess is None else origin
-    return damped_newton(
-        evaluate, Measures(sizes.work, sizes.turn, sizes.dot), start, floor, shares, again
-    )
+    linear = any(coupling.follows_rate for coupling in whole.couplings)
+    measures = Measures(sizes.work, sizes.turn, sizes.dot if linear else None)
+    return damped_newton(evaluate, measures, start, floor, shares, again)

@@ -64,11 +64,12 @@ class Damped(NamedTuple):
 
 class Measures(NamedTuple):
     """Measures of steps for `damped_newton`, with one entry per problem: `work`, the scalar product
-    of a residual and a step; `turn`, a norm of a step; and `dot`, the scalar product of two."""
+    of a residual and a step; `turn`, a norm of a step; and `dot`, the scalar product of two, where
+    convergence may be linear."""
 
     work: Callable[[Any, Any], Array]
     turn: Callable[[Any], Array]
-    dot: Callable[[Any, Any], Array]
+    dot: Callable[[Any, Any], Array] | None = None
 
 
 class _Guard(NamedTuple):
@@ -123,8 +124,8 @@ def damped_newton(
     - Extrapolation. The tangent may be approximate. Where it is much too stiff for a soft motion of
       the arm, the residual along a full step contracts only by $\rho$ near 1. The next step then
       includes $\rho^2 / (1 - \rho)$ of the last one, the remainder of the geometric series.
-    - Acceleration. Near the solution, steps that shrink linearly, as with friction, and not
-      quadratically are replaced by those of `accelerated`.
+    - Acceleration, with `measures.dot`. Near the solution, steps that shrink linearly, as with
+      friction, and not quadratically are replaced by those of `accelerated`.
     - Probing. Where the tangent is doubtful at the end, the arm is moved from the solution by the
       last step, made small, and creeps: $s_{n+1} = s_n + (H + \mu \Sigma)^{-1} r(x - s_n)$. The
       solution is unstable if the motion grows after some steps.
@@ -182,15 +183,15 @@ def damped_newton(
         )
         more = jnp.where(probe, 1.0, more)
         new_step = jax.tree.map(lambda s, last: s + more.astype(s.dtype) * last, new.step, step)
-        tail = ~probe & (measures.turn(step) < _TAIL) & (new.size > small)
-        linear = tail & _linear(old, guard)
-        both = linear & (old.whole > 0)
-        near = accelerated(new.step, step, earlier, both, measures.dot)
-        new_step = select(linear, near, new_step)
-        rate = jnp.where(linear, guard.contraction, 0.0)
-        kept = jnp.where(guard.whole > 0, old.rate, 0.0)
-        guard = guard._replace(rate=jnp.maximum(rate, kept))
-        earlier = select(taken, Earlier(new.step, step, earlier.proposed), earlier)
+        if measures.dot is not None:
+            tail = ~probe & (measures.turn(step) < _TAIL) & (new.size > small)
+            linear = tail & _linear(old, guard)
+            near = accelerated(new.step, step, earlier, linear & (old.whole > 0), measures.dot)
+            new_step = select(linear, near, new_step)
+            rate = jnp.where(linear, guard.contraction, 0.0)
+            kept = jnp.where(guard.whole > 0, old.rate, 0.0)
+            guard = guard._replace(rate=jnp.maximum(rate, kept))
+            earlier = select(taken, Earlier(new.step, step, earlier.proposed), earlier)
         pull = jnp.where(taken, measures.work(new.residual, new_step), guard.pull)
         go = going(old)
         ratio = measures.turn(new_step) / measures.turn(step)
@@ -215,7 +216,8 @@ def damped_newton(
         lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
         jax.eval_shape(evaluate, start, floor, floor).step,
     )
-    begin = (start, step, Earlier(step, step, step), first)
+    earlier = None if measures.dot is None else Earlier(step, step, step)
+    begin = (start, step, earlier, first)
     x, _, _, guard = lax.while_loop(
         lambda state: jnp.any(going(state[3]) | probing(state[3])), advance, begin
     )
