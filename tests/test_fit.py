@@ -372,6 +372,10 @@ def bad(free=FREE, value=None, scene=None, **options):
         (lambda: bad({"rod.material.young": 3.0}), "need a pair"),
         (lambda: bad({"rod.material.young": (2, 1)}), "need the least first"),
         (lambda: bad({"rod.material.young": (2, 2)}), "got equal bounds everywhere"),
+        (
+            lambda: bad({"inputs.gain": vsr.Unknown(0.5, 2.0, shared=True)}),
+            "shared: got True for one array",
+        ),
         (lambda: bad({"rod.material.young": vsr.Unknown(1, 2, prior=(1, 0))}), "a number > 0"),
         (lambda: bad({"inputs.gain": ([1, 2, 3], 4)}), r"got shape \(3,\)"),
         (lambda: bad({**FREE, "actuators[0].routing.slope_y": (0, 1)}), "by 'actuators"),

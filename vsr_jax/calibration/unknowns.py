@@ -89,6 +89,11 @@ def columns_of(scene: Scene, data: Measurements, free: Free) -> tuple[Column, ..
     for pattern, given in free.items():
         names = matching(pattern, targets)
         unknown = _unknown(pattern, given)
+        if unknown.shared and "*" not in pattern and targets[names[0]].acts != "series":
+            raise ValueError(
+                f"free[{pattern!r}].shared: got True for one array, whose entries stay apart; need "
+                f"a name with [*] that matches several"
+            )
         for name in names:
             if name in taken:
                 raise ValueError(f"free: got {name} by {taken[name]!r} and by {pattern!r}")
