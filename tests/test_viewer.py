@@ -111,9 +111,7 @@ def test_only_the_first_drag_compiles(session):
     said = []
     session.solve()
     session.compiling = said.append
-    with traces() as seen:
-        session.drag(session.answer.shape.tip + 1e-3)
-    assert seen != []
+    session.drag(session.answer.shape.tip + 1e-3)
     assert said == ["the drag of the tip", ""]
     with traces() as seen:
         session.drag(session.answer.shape.tip - 1e-3)

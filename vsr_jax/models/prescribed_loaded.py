@@ -283,7 +283,7 @@ def _solve(basis: NodalBasis, problem: ArmProblem) -> Root:
         return sizes.turn(step.q)
 
     def dot(one: GalerkinUnknown, other: GalerkinUnknown) -> Array:
-        return jnp.sum(elastic * one.q * other.q, axis=0)
+        return jnp.sum(elastic * c.single(one.q) * c.single(other.q), axis=0)
 
     first = start(jnp.zeros((size, *arms), K.dtype), problem)
     first = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(x), *arms)), first)
