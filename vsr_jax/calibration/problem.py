@@ -119,10 +119,13 @@ class FitProblem:
         solved &= np.all(np.isfinite(slopes), axis=(1, 2))
         return Evaluation(found.residual, slopes, solved, found.outcome)
 
+    @property
+    def _values(self) -> tuple[Array, ...]:
+        return tuple(one.value for one in self.data.observations)
+
     def at(self, x: np.ndarray, guess: Outcome | None = None) -> Evaluation:
         """Residuals of the measured shapes."""
-        values = tuple(one.value for one in self.data.observations)
-        return self.evaluate(x, self.data.inputs, self.data.series, values, guess)
+        return self.evaluate(x, self.data.inputs, self.data.series, self._values, guess)
 
     def cost(self, x: np.ndarray, near: Adjusted) -> float:
         """Cost at other values of the unknowns, without derivatives, with the standard deviations
@@ -135,7 +138,7 @@ class FitProblem:
             self.predictor,
             b + A @ x,
             data.inputs,
-            tuple(one.value for one in data.observations),
+            self._values,
             guess=near.outcome,
             chunk=min(CHUNK, len(data)),
         )

@@ -164,9 +164,9 @@ def _followed(
     too: $\delta x = s - \partial s / \partial\xi \, \delta\xi$ for their rows s.
 
     With $\delta x = s$ they would be one step late: twice as many steps, or none that converge."""
-    late = [i for i, one in enumerate(problem.couplings) if one.follows_rate]
-    if not late:
+    if not problem.follows_rate:
         return step
+    late = [i for i, one in enumerate(problem.couplings) if one.follows_rate]
 
     def rows(xi: Vector) -> tuple:
         at = state_of(xi, unknown.coupled, problem)
@@ -211,6 +211,5 @@ def _solve(
     shares = 1 if whole.loads is None else LOAD_INCREMENTS
     floor = jnp.broadcast_to(rounding_of(whole), arms)
     again = None if guess is None else origin
-    linear = any(coupling.follows_rate for coupling in whole.couplings)
-    measures = Measures(sizes.work, sizes.turn, sizes.dot if linear else None)
+    measures = Measures(sizes.work, sizes.turn, sizes.dot if whole.follows_rate else None)
     return damped_newton(evaluate, measures, start, floor, shares, again)

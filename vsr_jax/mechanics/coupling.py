@@ -67,6 +67,12 @@ class ArmProblem(NamedTuple):
         )
 
     @property
+    def follows_rate(self) -> bool:
+        """Whether a coupling follows the strain and its derivative along the arm: the tangent lacks
+        what that does to the forces, so that Newton's method converges linearly."""
+        return any(coupling.follows_rate for coupling in self.couplings)
+
+    @property
     def length(self) -> Array:
         """Length of the arm [m]."""
         return jnp.sum(self.grid.h, axis=0)

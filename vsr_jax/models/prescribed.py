@@ -169,7 +169,7 @@ class Prescribed(SteppedModel):
 
     def _at_nodes(self, scene: Scene, problem: ArmProblem) -> prescribed_loaded.NodalBasis:
         X = problem.grid.X.reshape(-1)
-        rated = any(coupling.follows_rate for coupling in problem.couplings)
+        rated = problem.follows_rate
 
         def at(x: Scalar) -> Array:
             return self.basis.matrix(x, scene.rod.length)

@@ -289,8 +289,7 @@ def _solve(basis: NodalBasis, problem: ArmProblem) -> Root:
     first = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(x), *arms)), first)
     floor = jnp.broadcast_to(rounding_of(problem), arms)
     shares = 1 if problem.loads is None else LOAD_INCREMENTS
-    linear = any(coupling.follows_rate for coupling in problem.couplings)
-    measures = Measures(work, turn, dot if linear else None)
+    measures = Measures(work, turn, dot if problem.follows_rate else None)
     return damped_newton(evaluate, measures, first, floor, shares)
 
 

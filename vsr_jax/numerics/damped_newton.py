@@ -77,8 +77,10 @@ class _Guard(NamedTuple):
     of the sum of all steps to come, size of the residual, whether the tangent is definite, the work
     of the residual over the step; damping, load increments applied, whether the step may be tried,
     how often an undamped step raised an accepted residual, whether the loads come by increments,
-    the number of evaluations and of plain Newton steps; whether the solution is to be probed, the
-    number of probes, and the growth of the motion in them."""
+    the number of evaluations and of plain Newton steps; the number of undamped steps in a row under
+    the same loads, by what factor the last of them became smaller, and their rate where they shrink
+    linearly; whether the solution is to be probed, the number of probes, and the growth of the
+    motion in them."""
 
     size: Array
     miss: Array
@@ -129,10 +131,9 @@ def damped_newton(
     - Probing. Where the tangent is doubtful at the end, the arm is moved from the solution by the
       last step, made small, and creeps: $s_{n+1} = s_n + (H + \mu \Sigma)^{-1} r(x - s_n)$. The
       solution is unstable if the motion grows after some steps.
-
     - Last step. Near the solution, where the last step and residual were at most `_CERTAIN` of
       those before, the next step is taken without another evaluation if what it leaves, by the
-      same ratio, is negligible and accepted.
+      same ratio or the rate of linear convergence, is negligible and accepted.
 
     The iteration ends with a last step, or where the residual is accepted, the step is undamped,
     and either the step times $1 / (1 - \rho)$, the sum of all steps to come, is negligible, or the
@@ -188,9 +189,7 @@ def damped_newton(
             linear = tail & _linear(old, guard)
             near = accelerated(new.step, step, earlier, linear & (old.whole > 0), measures.dot)
             new_step = select(linear, near, new_step)
-            rate = jnp.where(linear, guard.contraction, 0.0)
-            kept = jnp.where(guard.whole > 0, old.rate, 0.0)
-            guard = guard._replace(rate=jnp.maximum(rate, kept))
+            guard = guard._replace(rate=_slowest(old, guard, linear))
             earlier = select(taken, Earlier(new.step, step, earlier.proposed), earlier)
         pull = jnp.where(taken, measures.work(new.residual, new_step), guard.pull)
         go = going(old)
@@ -357,6 +356,13 @@ def _linear(old: _Guard, guard: _Guard) -> Array:
     """Whether steps shrink by nearly the same factor, and not by its square."""
     there = guard.whole > old.whole
     return there & (guard.contraction > _QUADRATIC * old.contraction)
+
+
+def _slowest(old: _Guard, guard: _Guard, linear: Array) -> Array:
+    """Rate of linear convergence since the loads, the damping or the attempt changed, 0 if there
+    was none."""
+    rate = jnp.where(linear, guard.contraction, 0.0)
+    return jnp.maximum(rate, jnp.where(guard.whole > 0, old.rate, 0.0))
 
 
 def _raised(damping: Array) -> Array:

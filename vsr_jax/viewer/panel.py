@@ -133,10 +133,8 @@ def loads_html(shape: Shape | None, widening: float) -> str:
     """The legend of arrows, and the factor by which the section is drawn wider."""
     lines = []
     for row in shape.loads if shape is not None else []:
-        color = load_color(len(row.places) == 1, row.moment)
-        what = "moment" if row.moment else "force"
-        text = f"{row.name}: {what} {row.greatest:.3g} {row.unit}"
-        lines.append(f'<div><span style="color:{color}">&rarr;</span> {html.escape(text)}</div>')
+        arrow = f'<span style="color:{load_color(row)}">&rarr;</span>'
+        lines.append(f"<div>{arrow} {html.escape(row.caption)}</div>")
     if shape is not None and shape.body.slack is not None and bool(np.any(shape.body.slack)):
         lines.append("<div>dashed: slack tendon</div>")
     if widening > 1:

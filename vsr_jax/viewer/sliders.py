@@ -13,9 +13,8 @@ import numpy as np
 from ..arm.actuator import Actuator, Tendon
 from ..arm.scene import Scene
 from ..arm.scene_numbers import Parameter, matching, parameters
+from ..optimization.problem import INPUTS
 from ..validation import interval, numbers as checked_numbers
-
-INPUTS = "inputs"
 
 _PREFIXED = ("m", "Pa", "N", "N m")
 """Units that are shown with a prefix."""

@@ -7,6 +7,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.typing import ColorType
 
 from ..arm.loads import Gravity
+from ..viz.annotate import Row
 from ..viz.body import Body
 from ..viz.space import FRAME_COLORS
 from ..viz.style import COLORS, Theme, mixed, settings
@@ -123,7 +124,7 @@ class Stage:
         arrows = self._arrows.arrows(rows, self._length)
         points = np.concatenate([np.zeros((0, 2, 3)), *arrows])
         colors = [
-            np.broadcast_to(_bytes(load_color(len(row.places) == 1, row.moment)), (len(a), 3))
+            np.broadcast_to(_bytes(load_color(row)), (len(a), 3))
             for row, a in zip(rows, arrows, strict=True)
         ]
         self._arrow_node("/loads", points, np.concatenate([np.zeros((0, 3)), *colors]), 0.004)
@@ -210,32 +211,24 @@ class Stage:
         node.color, node.opacity, node.visible = tuple(int(x) for x in color), opacity, True
 
     def _lines(self, name: str, points: np.ndarray, colors: np.ndarray, width: float) -> None:
-        if not len(points):
-            self._hide(name)
-            return
-        node = self._nodes.get(name)
-        if node is None:
-            self._nodes[name] = self._server.scene.add_line_segments(
-                name, points, linear(colors), thickness=width, thickness_units="screen"
-            )
-            return
-        node.points, node.colors = points.astype(np.float32), linear(colors)
-        node.visible = True
+        add = self._server.scene.add_line_segments
+        self._colored(add, name, points, colors, thickness=width, thickness_units="screen")
 
     def _arrow_node(self, name: str, points: np.ndarray, colors: np.ndarray, radius: float) -> None:
+        size = radius * self._length
+        options = {"shaft_radius": size, "head_radius": 3 * size, "head_length": 8 * size}
+        self._colored(self._server.scene.add_arrows, name, points, colors, **options)
+
+    def _colored(
+        self, add: Any, name: str, points: np.ndarray, colors: np.ndarray, **options: Any
+    ) -> None:
+        """Adds a node of segments, or changes the one of that name."""
         if not len(points):
             self._hide(name)
             return
         node = self._nodes.get(name)
         if node is None:
-            self._nodes[name] = self._server.scene.add_arrows(
-                name,
-                points,
-                linear(colors),
-                shaft_radius=radius * self._length,
-                head_radius=3 * radius * self._length,
-                head_length=8 * radius * self._length,
-            )
+            self._nodes[name] = add(name, points, linear(colors), **options)
             return
         node.points, node.colors = points.astype(np.float32), linear(colors)
         node.visible = True
@@ -257,11 +250,9 @@ def factors(body: Body) -> tuple[float, float]:
     return 1.0, float(f"{wanted / radius:.2g}") if radius < wanted else 1.0
 
 
-def load_color(at_point: bool, moment: bool) -> ColorType:
-    """Colour of the arrows of a load: forces and moments at points, and along the arm."""
-    if moment:
-        return COLORS[2]
-    return COLORS[3] if at_point else COLORS[4]
+def load_color(row: Row) -> str:
+    """Colour of the arrows of a load; lines are not dashed here, so that moments have their own."""
+    return COLORS[2] if row.moment else row.color
 
 
 def linear(colors: np.ndarray) -> np.ndarray:

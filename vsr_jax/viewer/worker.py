@@ -20,7 +20,7 @@ class Worker:
         self._thread.start()
 
     def post(self, kind: str, job: Callable[[], None]) -> threading.Event:
-        """Hands over a job; the event is set when it, or a newer one of its kind, is done."""
+        """Adds a job; the event is set when it, or a newer one of its kind, is done."""
         with self._changed:
             done = self._jobs[kind][1] if kind in self._jobs else threading.Event()
             self._jobs[kind] = (job, done)

@@ -99,6 +99,22 @@ class Row(NamedTuple):
     vectors: np.ndarray
 
     @property
+    def at_point(self) -> bool:
+        """Whether the load acts at one place."""
+        return len(self.places) == 1
+
+    @property
+    def color(self) -> str:
+        """Colour of its arrows."""
+        return COLORS[3] if self.at_point else COLORS[4]
+
+    @property
+    def caption(self) -> str:
+        """Its text in a legend."""
+        what = "moment" if self.moment else "force"
+        return f"{self.name}: {what} {self.greatest:.3g} {self.unit}"
+
+    @property
     def moment(self) -> bool:
         """Whether these are moments."""
         return self.unit.startswith("N m")
@@ -159,17 +175,13 @@ def _wrench(load: Load, rod: Rod, X: Array, poses: Array) -> Array:
 
 
 def _draw_arrows(ax: Axes3D, row: Row, arrows: np.ndarray, color: ColorType | None) -> None:
-    at_point = len(row.places) == 1
-    color = (COLORS[3] if at_point else COLORS[4]) if color is None else color
-    style: dict[str, Any] = {"color": color, "linewidth": 2.2 if at_point else 0.9}
+    color = row.color if color is None else color
+    style: dict[str, Any] = {"color": color, "linewidth": 2.2 if row.at_point else 0.9}
     dashes: dict[str, Any] = {"linestyle": (0.0, (2.0, 1.0))} if row.moment else {}
     ax.quiver(*row.places.T, *arrows.T, arrow_length_ratio=0.25, **style, **dashes)
-    if not at_point:
+    if not row.at_point:
         ax.plot(*(row.places + arrows).T, **{**style, "linewidth": 0.6})
-    what = "moment" if row.moment else "force"
-    ax.plot(
-        [], [], [], label=f"{row.name}: {what} {row.greatest:.3g} {row.unit}", **style, **dashes
-    )
+    ax.plot([], [], [], label=row.caption, **style, **dashes)
 
 
 def ellipsoid(
