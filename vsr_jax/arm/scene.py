@@ -16,6 +16,7 @@ from ..typing import ArrayLike, DTypeLike, Scalar, VectorLike, cast
 from ..validation import ROUNDING, concrete, instance, is_traced, numbers, precise
 from .actuator import Actuator
 from .description import Part, describe, described_arguments, table
+from .held import Held
 from .loads import Frame, Load
 from .pose_loads import PoseLoad
 from .profile import Limits
@@ -52,6 +53,7 @@ class Scene(Part):
     - `actuators`: `Thread`, `Tendon` and `Chamber` in the order of the inputs.
     - `loads`: `Gravity`, `TipWrench`, `PointWrench` and `DistributedWrench`; with the pose of
       their section change `Spring`, `Payload`, `MagneticMoment`, `MagneticDensity` and `Spinning`.
+    - `held`: sections that are pinned, clamped or guided in space, `Held`.
     - `free_strains`: names of the strains that can change, all six by default. The others equal
       their rest value and are not unknowns of the solve. `("bending_y", "bending_z")` is an
       inextensible rod without twist and shear.
@@ -70,6 +72,7 @@ class Scene(Part):
     rod: Rod
     actuators: tuple[Actuator, ...]
     loads: tuple[Load, ...]
+    held: tuple[Held, ...]
     free_strains: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(
@@ -78,6 +81,7 @@ class Scene(Part):
         actuators: Sequence[Actuator] | Actuator = (),
         loads: Sequence[Load] | Load = (),
         *,
+        held: Sequence[Held] | Held = (),
         free_strains: Sequence[str] = STRAINS,
     ):
         self.rod = instance("Scene.rod", rod, Rod, "a Rod")
@@ -85,6 +89,7 @@ class Scene(Part):
             "Scene.actuators", actuators, Actuator, "a Thread, Tendon or Chamber"
         )
         self.loads = _each("Scene.loads", loads, Load, "a Gravity, TipWrench, Spring or other load")
+        self.held = _each("Scene.held", held, Held, "a Held")
         names = (free_strains,) if isinstance(free_strains, str) else tuple(free_strains)
         if not names or any(name not in STRAINS for name in names):
             raise ValueError(
@@ -98,7 +103,7 @@ class Scene(Part):
     def __repr__(self) -> str:
         rod = described_arguments(self.rod) if isinstance(self.rod, Part) else []
         rows = [(f"rod.{name}", text) for name, text in rod] or [("rod", describe(self.rod))]
-        for name in ("actuators", "loads"):
+        for name in ("actuators", "loads", "held"):
             parts = getattr(self, name)
             if isinstance(parts, tuple):
                 rows += [(f"{name}[{i}]", _line(part)) for i, part in enumerate(parts)]
@@ -114,6 +119,7 @@ class Scene(Part):
         threads = [actuator.effects for actuator in self.actuators]
         loads = [load.effects for load in self.loads]
         names = [effects[0] for effects in (*threads, *loads)]
+        names += [held.effect for held in self.held]
         names += [option for effects in loads for option in effects[1:]]
         names += ["sections"] if self.breakpoints else []
         names += [option for effects in threads for option in effects[1:]]
@@ -138,9 +144,14 @@ class Scene(Part):
 
     @property
     def coupled(self) -> bool:
-        """Whether the cross-sections depend on each other: through loads, given thread lengths or
-        friction."""
-        return bool(self.loads or self.length_driven or self.frictional)
+        """Whether the cross-sections depend on each other: through loads, held sections, given
+        thread lengths or friction."""
+        return bool(self.loaded or self.length_driven or self.frictional)
+
+    @property
+    def loaded(self) -> bool:
+        """Whether anything but the threads exerts wrenches on the arm: loads and held sections."""
+        return bool(self.loads or self.held)
 
     @property
     def breakpoints(self) -> tuple[Scalar, ...]:
@@ -150,6 +161,7 @@ class Scene(Part):
             *self.rod.breakpoints,
             *laid,
             *(x for load in self.loads for x in load.breakpoints(self.rod)),
+            *(held.X for held in self.held if held.X is not None),
         )
 
     def edges(self, more: tuple[Scalar, ...] = ()) -> Float[Array, " edges"]:
@@ -296,7 +308,7 @@ class Scene(Part):
         return cast(self, dtype)
 
     def _check_numbers(self) -> None:
-        if any(is_traced(leaf) for leaf in jax.tree.leaves((self.rod, self.actuators, self.loads))):
+        if any(is_traced(leaf) for leaf in jax.tree.leaves(self)):
             return
         length = float(numbers("Scene.rod.length", self.rod.length, positive=True))
         self._check_places(length)
@@ -326,7 +338,8 @@ class Scene(Part):
                 )
 
     def _check_places(self, length: float) -> None:
-        """Raises `ValueError` if a thread end or a point load is beyond the arm."""
+        """Raises `ValueError` if a thread end, a point load or a held section is beyond the arm,
+        or a section is held twice."""
         beyond = length * (1 + ROUNDING)
         for i, actuator in enumerate(self.actuators):
             for name, x in (("start", actuator.start), ("end", actuator.end)):
@@ -343,6 +356,17 @@ class Scene(Part):
                 raise ValueError(
                     f"Scene.loads[{i}].X: got {float(X):g} m, need a place on the arm of "
                     f"{length:g} m"
+                )
+        places = [float(held.place(self.rod)) for held in self.held]
+        for i, X in enumerate(places):
+            if X > beyond:
+                raise ValueError(
+                    f"Scene.held[{i}].X: got {X:g} m, need a place on the arm of {length:g} m"
+                )
+            if X in places[:i]:
+                raise ValueError(
+                    f"Scene.held[{i}].X: got {X:g} m, which Scene.held[{places.index(X)}] holds "
+                    f"already, need one Held per section"
                 )
 
 

@@ -17,9 +17,10 @@ from ..numerics.quadrature import Grid
 from ..numerics.stacked import components
 from .balance import free_components, residual
 from .cable import lengths_of
-from .coupling import ArmProblem, ArmState, Carried, Coupling, Shares, forces_at
+from .coupling import ArmProblem, ArmState, Carried, Coupling, Shares, forces_at, loads_with
 from .friction import friction_of
-from .reaction import loading, react
+from .held import holds_of
+from .reaction import Loading, loading, react
 from .sizes import pull_of, shape_of, shape_size
 
 
@@ -44,6 +45,10 @@ class ArmSolution(NamedTuple):
     coupled: tuple[PyTree, ...]
     couplings: tuple[Coupling, ...]
 
+    def loading(self, loads: Loading | None) -> Loading | None:
+        """The loads, and the wrenches that the couplings exert on the arm."""
+        return loads_with(self.couplings, self.coupled, loads)
+
     def shares_at(self, scene: Scene, grid: Grid, X: Array, forces: Forces) -> Shares:
         """Share of each thread's force at abscissas X of any shape; `grid` is that of the nodes,
         `forces` are those at the start."""
@@ -56,7 +61,12 @@ class ArmSolution(NamedTuple):
 def couplings_of(scene: Scene, inputs: Array, problem: ArmProblem) -> tuple[Coupling, ...]:
     """All couplings of a scene."""
     grid = problem.grid
-    found = (lengths_of(scene, inputs, problem.sections, grid), friction_of(scene, grid))
+    sections = problem.sections
+    found = (
+        lengths_of(scene, inputs, sections, grid),
+        friction_of(scene, grid),
+        holds_of(scene, sections, grid),
+    )
     return tuple(coupling for coupling in found if coupling is not None)
 
 
@@ -72,8 +82,9 @@ def state_of(xi: Vector, coupled: tuple[PyTree, ...], problem: ArmProblem) -> Ar
     grid, couplings = problem.grid, problem.couplings
     forces = forces_at(couplings, coupled, problem.forces)
     carried = _carried(xi, coupled, problem, forces)
-    along = None if problem.loads is None else react(xi, grid, problem.loads)
-    at = ArmState(xi, carried, shared(forces, carried.shares), along, ())
+    loads = loads_with(couplings, coupled, problem.loads)
+    along = None if loads is None else react(xi, grid, loads)
+    at = ArmState(xi, carried, shared(forces, carried.shares), loads, along, ())
     pairs = zip(couplings, coupled, strict=True)
     return at._replace(notes=tuple(coupling.note(x, at, problem) for coupling, x in pairs))
 

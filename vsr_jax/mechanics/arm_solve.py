@@ -212,4 +212,4 @@ def _solve(
     floor = jnp.broadcast_to(rounding_of(whole), arms)
     again = None if guess is None else origin
     measures = Measures(sizes.work, sizes.turn, sizes.dot if whole.follows_rate else None)
-    return damped_newton(evaluate, measures, start, floor, shares, again)
+    return damped_newton(evaluate, measures, start, floor, shares, again, exact=whole.softens)

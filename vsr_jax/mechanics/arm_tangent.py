@@ -56,7 +56,7 @@ def approximate_solve(
         (*row[:-1], row[-1] + damping * s) for row, s in zip(lower, sections.stiffness, strict=True)
     )
 
-    along, loads = at.along, problem.loads
+    along, loads = at.along, at.loads
     slopes = None if along is None or loads is None else slopes_of(along, loads)
 
     def solve(b: Vector) -> tuple[Vector, Definiteness]:

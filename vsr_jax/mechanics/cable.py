@@ -19,6 +19,7 @@ from ..arm.scene import CrossSections, Scene
 from ..numerics import component as c
 from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import Grid
+from ..numerics.stacked import stack
 from ..typing import Scalar
 from .balance import largest_force_scale, thread_direction, thread_wrench
 from .coupling import ArmProblem, ArmState, Border, Coupling
@@ -97,8 +98,8 @@ class Lengths(Coupling):
             stretch = cable.scale * cable.stretch(gains[place], grid)
             corner.append(jnp.where(loose, 1.0, stretch))
         return Border(
-            tuple(c.times(gains[place], wrench) for place, wrench in pairs),
-            tuple(c.times(sections.reach[place], wrench) for place, wrench in pairs),
+            _stacked([c.times(gains[place], wrench) for place, wrench in pairs]),
+            _stacked([c.times(sections.reach[place], wrench) for place, wrench in pairs]),
             jnp.stack(factors),
             jnp.stack(corner),
         )
@@ -123,6 +124,10 @@ class Lengths(Coupling):
         weight = problem.grid.weight
         axial = jnp.sum(weight * problem.sections.stiffness[3]) / problem.length
         return jnp.broadcast_to(1 / axial, (len(self.cables),))
+
+
+def _stacked(wrenches: list[Vector]) -> Vector:
+    return tuple(stack(parts) for parts in zip(*wrenches, strict=True))
 
 
 def lengths_of(scene: Scene, inputs: Array, sections: CrossSections, grid: Grid) -> Lengths | None:

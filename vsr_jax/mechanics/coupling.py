@@ -54,8 +54,15 @@ class ArmProblem(NamedTuple):
     couplings: tuple["Coupling", ...]
 
     def with_share(self, share: Array) -> "ArmProblem":
-        """The problem with a fraction of its loads."""
-        return self if self.loads is None else self._replace(loads=self.loads.scaled(share))
+        """The problem with a fraction of its loads. Constraints that soften are springs up to the
+        fraction 1, with all loads, and exact above it."""
+        if self.loads is None:
+            return self
+        if not self.softens:
+            return self._replace(loads=self.loads.scaled(share))
+        soft = (share <= 1).astype(share.dtype)
+        couplings = tuple(coupling.softened(soft) for coupling in self.couplings)
+        return self._replace(loads=self.loads.scaled(jnp.minimum(share, 1.0)), couplings=couplings)
 
     def at_rest(self) -> "ArmProblem":
         """The problem without loads and forces and with relaxed couplings, so that its solution is
@@ -73,6 +80,11 @@ class ArmProblem(NamedTuple):
         return any(coupling.follows_rate for coupling in self.couplings)
 
     @property
+    def softens(self) -> bool:
+        """Whether a coupling is a constraint that springs can replace on the way to a solution."""
+        return any(coupling.softens for coupling in self.couplings)
+
+    @property
     def length(self) -> Array:
         """Length of the arm [m]."""
         return jnp.sum(self.grid.h, axis=0)
@@ -80,11 +92,13 @@ class ArmProblem(NamedTuple):
 
 class ArmState(NamedTuple):
     """Quantities computed from the unknowns: the strain, what the threads carry, their forces at
-    the nodes, the reaction (None without loads), and what each coupling noted."""
+    the nodes, the loads with those of the couplings, the reaction (both None without loads), and
+    what each coupling noted."""
 
     xi: Vector
     carried: Carried
     tau: Forces
+    loads: Loading | None
     along: Reaction | None
     notes: tuple[Any, ...]
 
@@ -92,14 +106,15 @@ class ArmState(NamedTuple):
 class Border(NamedTuple):
     r"""Part of a coupling with m unknowns in the tangent system.
 
-    - `columns`: P, for each unknown the wrench at the nodes that it adds to the residual.
+    - `columns`: P, for each unknown the wrench at the nodes that it adds to the residual: six
+      components, each of shape (m, stages, steps, ...).
     - `rows`: R, for each row a wrench at the nodes; its work over a change of strain, times the
       factor, is the change of the row.
     - `factors`: F, shape (m, ...). `corner`: the diagonal of D, shape (m, ...).
     """
 
-    columns: tuple[Vector, ...]
-    rows: tuple[Vector, ...]
+    columns: Vector
+    rows: Vector
     factors: Array
     corner: Array
 
@@ -111,6 +126,9 @@ class Coupling(eqx.Module):
     follows_rate: ClassVar[bool] = False
     """Whether the strain and its derivative along the arm give its unknowns."""
 
+    softens: ClassVar[bool] = False
+    """Whether it is a constraint on the shape that springs can replace on the way to a solution."""
+
     @abstractmethod
     def relaxed(self) -> "Coupling":
         """The coupling with the rest strain as its solution."""
@@ -118,6 +136,15 @@ class Coupling(eqx.Module):
     @abstractmethod
     def guess(self, forces: Forces, grid: Grid) -> PyTree:
         """Unknowns that go with the forces of all threads at their start, to begin with."""
+
+    def softened(self, soft: Array) -> "Coupling":
+        """The coupling with springs in place of its constraint where `soft` is 1, exact where it is
+        0; the same by default."""
+        return self
+
+    def loads(self, x: PyTree, loads: Loading | None) -> Loading | None:
+        """The loads, and the wrenches that it exerts on the arm; none by default."""
+        return loads
 
     @abstractmethod
     def residual(
@@ -200,6 +227,15 @@ def forces_at(couplings: tuple[Coupling, ...], unknowns: tuple, forces: Forces) 
     return forces
 
 
+def loads_with(
+    couplings: tuple[Coupling, ...], unknowns: tuple, loads: Loading | None
+) -> Loading | None:
+    """The loads, and the wrenches that the couplings exert on the arm."""
+    for coupling, x in zip(couplings, unknowns, strict=True):
+        loads = coupling.loads(x, loads)
+    return loads
+
+
 def borders_of(
     problem: ArmProblem, unknowns: tuple, at: ArmState
 ) -> tuple[tuple[int, ...], Border | None]:
@@ -212,11 +248,15 @@ def borders_of(
     places = tuple(i for i, border in enumerate(each) if border is not None)
     if not found:
         return places, None
-    columns, rows, factors, corners = zip(*found, strict=True)
-    whole = Border(
-        sum(columns, ()), sum(rows, ()), jnp.concatenate(factors), jnp.concatenate(corners)
-    )
-    return places, whole
+    return places, jax.tree.map(lambda *parts: _listed(parts), *found)
+
+
+def _listed(parts: tuple[Array, ...]) -> Array:
+    """Arrays (m, ...) one after another, the axes behind of the same sizes."""
+    if len(parts) == 1:
+        return parts[0]
+    shape = jnp.broadcast_shapes(*(part.shape[1:] for part in parts))
+    return jnp.concatenate([jnp.broadcast_to(part, (len(part), *shape)) for part in parts])
 
 
 def bordered_solve(
@@ -232,18 +272,15 @@ def bordered_solve(
     side; `right`: that of the couplings, shape (m, ...).
     """
 
-    def work(row: Vector, change: Vector) -> Array:
-        return jnp.sum(grid.weight * c.dot(row, change), axis=(-grid.X.ndim, 1 - grid.X.ndim))
+    def work(rows: Vector, change: Vector) -> Array:
+        return jnp.sum(grid.weight * c.dot(rows, change), axis=(-grid.X.ndim, 1 - grid.X.ndim))
 
-    answers = jax.vmap(solve)(jax.tree.map(lambda *v: jnp.stack(v), *border.columns))
-    size = len(border.rows)
-    given = jnp.stack([work(row, strain) for row in border.rows])
+    answers = jax.vmap(solve)(border.columns)
+    size = len(border.factors)
+    given = work(border.rows, strain)
     unit = jnp.eye(size, dtype=right.dtype).reshape(size, size, *(1,) * (right.ndim - 1))
-    schur = [
-        unit[i] * border.corner[i] - border.factors[i] * work(row, answers)
-        for i, row in enumerate(border.rows)
-    ]
-    factors = lu.factor(jnp.stack(schur))
+    pulled = work(tuple(row[:, None] for row in border.rows), answers)
+    factors = lu.factor(unit * border.corner[:, None] - border.factors[:, None] * pulled)
     x = lu.substitute(factors, right - border.factors * given)
     strain = tuple(
         a - jnp.sum(x[:, None, None] * answer, axis=0)

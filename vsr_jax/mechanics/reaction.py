@@ -116,7 +116,8 @@ class Reaction(NamedTuple):
     r"""Results of both passes: matrices (3, 3, ...), vectors (3, ...) and wrenches (6, ...), with
     the axes (stages, steps) of the nodes behind.
 
-    - `starts`, `rotation`: rotations at the start of each step, (3, 3, steps), and at the nodes.
+    - `starts`, `end`, `rotation`: rotations at the start of each step, (3, 3, steps), at the end of
+      the arm, (3, 3), and at the nodes.
     - `world`, `density`: wrench $(m, n)$ in the world frame and its density $(c + p' \times n, f)$
       at the nodes.
     - `wrench`: $\Lambda$ in the body frame.
@@ -127,6 +128,7 @@ class Reaction(NamedTuple):
     """
 
     starts: Array
+    end: Array
     rotation: Array
     world: Array
     density: Array
@@ -163,7 +165,7 @@ class Slopes(NamedTuple):
 
 def loading(scene: Scene, grid: Grid) -> Loading | None:
     """The loads of a scene on a grid; None if it has none."""
-    if not scene.loads:
+    if not scene.loaded:
         return None
     dead_density, follower_density = (scene.density(grid.X, frame) for frame in ("world", "body"))
     density = None if dead_density is None else stack(dead_density)
@@ -235,7 +237,7 @@ def react(xi: Vector, grid: Grid, loads: Loading) -> Reaction:
     density = zero if loads.dead_density is None else loads.dead_density
     body_density = turned(back, density)
     points = tuple(
-        turned(_rotation_at(starts, end, point.step), point.wrench)
+        turned(rotation_at(starts, end, point.step), point.wrench)
         for point in loads.follower_points
     )
     for point, wrench in zip(loads.follower_points, points, strict=True):
@@ -257,7 +259,9 @@ def react(xi: Vector, grid: Grid, loads: Loading) -> Reaction:
     arm = cross(axis, rows(world, 3, 6))
     world, density = _with_moment(world, beyond(arm, grid)), _with_moment(density, arm)
     wrench = turned(back, world)
-    return Reaction(starts, R, world, density, wrench, axis, points, follower, body_density, seen)
+    return Reaction(
+        starts, end, R, world, density, wrench, axis, points, follower, body_density, seen
+    )
 
 
 def _seen(
@@ -278,7 +282,7 @@ def _seen(
             seen.append((R, nodes))
         else:
             place = (base + sum_along(term.before * axis, grid))[:, 0, 0] if positions else None
-            seen.append((_rotation_at(starts, end, term.step), place))
+            seen.append((rotation_at(starts, end, term.step), place))
     return tuple(seen)
 
 
@@ -358,7 +362,7 @@ def react_at(xi: Vector, grid: Grid, loads: Loading, X: Array) -> Vector:
     return components(turned(transpose(R), world))
 
 
-def _rotation_at(starts: Array, end: Array, step: Array) -> Array:
+def rotation_at(starts: Array, end: Array, step: Array) -> Array:
     """Rotation at the start of a step, or at the end of the arm for the step after the last."""
     whole = jnp.concatenate([starts, end[:, :, None]], axis=2)
     here = jnp.arange(whole.shape[2]).reshape(-1, *(1,) * step.ndim) == step

@@ -16,6 +16,7 @@ from ..arm.scene import CrossSections, Scene, shared
 from ..mechanics.arm_balance import ArmUnknown, problem_of
 from ..mechanics.balance import thread_direction, thread_wrench
 from ..mechanics.coupling import ArmProblem
+from ..mechanics.reaction import Loading, loading
 from ..mechanics.resolution import COARSE, step_error
 from ..numerics.component import Forces, Vector, dot
 from ..numerics.magnus import step_components, step_poses, tip_pose
@@ -150,6 +151,10 @@ class Model(eqx.Module):
     def nodes(self, scene: Scene, forces: Forces, state: Any) -> Nodes:
         """Nodes from which integrals along the arm are computed."""
 
+    def loading(self, scene: Scene, state: Any, grid: Grid) -> Loading | None:
+        """The loads on the grid of a solution, and the wrenches of what holds the arm."""
+        return loading(scene, grid)
+
     @abstractmethod
     def finer(self) -> "Model":
         """The same model with twice the steps, or with tighter tolerances if the steps are
@@ -221,7 +226,7 @@ class SteppedModel(Model):
         sections = nodes.sections._replace(
             reach=nodes.shares
         )  # friction reduces a thread's force, loads do not
-        return step_error(nodes.xi, sections, forces, nodes.grid, loaded=bool(scene.loads))
+        return step_error(nodes.xi, sections, forces, nodes.grid, loaded=scene.loaded)
 
     @abstractmethod
     def node_strain(self, scene: Scene, state: Any) -> Vector:

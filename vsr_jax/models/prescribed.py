@@ -161,9 +161,7 @@ class Prescribed(SteppedModel):
         q, coupled = unknown.q, prescribed_loaded.coupled_of(unknown, basis, problem)
         forces = forces_at(problem.couplings, coupled, problem.forces)
         at = prescribed_loaded.state_of(unknown, basis, problem)
-        status = classify(
-            at.xi, problem.sections, at.tau, balanced, definite, loaded=bool(scene.loads)
-        )
+        status = classify(at.xi, problem.sections, at.tau, balanced, definite, loaded=scene.loaded)
         sound = status == Status.CONVERGED
         return Outcome(jnp.where(sound, q, 0.0), forces_where(sound, forces), status, steps)
 

@@ -133,26 +133,24 @@ def approximate_tangent(
         return jax.tree.map(lambda x: jnp.expand_dims(x, x.ndim - behind), tree)
 
     change = c.matvec(c.symmetric(beside(tangent(at.xi, sections, at.tau))), columns)
-    if at.along is not None and problem.loads is not None:
-        slopes = slopes_of(at.along, problem.loads)
+    if at.along is not None and at.loads is not None:
+        slopes = slopes_of(at.along, at.loads)
         moved = reaction_change(stack(columns), *beside((at.along, slopes, grid)))
         change = c.subtract(change, components(moved))
     K = _gathered(matrix, change, grid)
     _, border = borders_of(problem, unknown.coupled, at)
     if border is None:
         return K
-    size = len(border.rows)
+    size = len(border.factors)
     unit = jnp.eye(size, dtype=K.dtype).reshape(size, size, *(1,) * behind)
-    by_q = [
-        factor * _projected(matrix, row, grid)
-        for factor, row in zip(border.factors, border.rows, strict=True)
-    ]
-    pulls = jnp.stack([_projected(matrix, column, grid) for column in border.columns], axis=1)
+    project = jax.vmap(lambda wrench: _projected(matrix, wrench, grid))
+    by_q = border.factors[:, None] * project(border.rows)
+    pulls = jnp.moveaxis(project(border.columns), 0, 1)
     corner = jnp.broadcast_to(unit * border.corner, (size, size, *pulls.shape[2:]))
     return jnp.concatenate(
         [
             jnp.concatenate([K, pulls], axis=1),
-            jnp.concatenate([jnp.stack(by_q), corner], axis=1),
+            jnp.concatenate([by_q, corner], axis=1),
         ]
     )
 
@@ -290,7 +288,7 @@ def _solve(basis: NodalBasis, problem: ArmProblem) -> Root:
     floor = jnp.broadcast_to(rounding_of(problem), arms)
     shares = 1 if problem.loads is None else LOAD_INCREMENTS
     measures = Measures(work, turn, dot if problem.follows_rate else None)
-    return damped_newton(evaluate, measures, first, floor, shares)
+    return damped_newton(evaluate, measures, first, floor, shares, exact=problem.softens)
 
 
 def _doubtful(J: Array, elastic: Array) -> Array:

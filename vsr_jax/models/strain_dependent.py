@@ -27,7 +27,7 @@ from ..mechanics.balance import (
     without_force,
 )
 from ..mechanics.coupling import ArmProblem, Coupling, forces_at
-from ..mechanics.reaction import loading, react_at
+from ..mechanics.reaction import Loading, react_at
 from ..numerics.component import Forces, Vector
 from ..numerics.magnus import ORDERS
 from ..numerics.quadrature import Grid
@@ -120,7 +120,7 @@ class StrainDependent(SteppedModel):
         unknown, balanced, definite, steps = solve_arm(problem, scene.free, guess)
         tau = carried_forces(unknown, problem)
         status = classify(
-            unknown.xi, problem.sections, tau, balanced, definite, loaded=bool(scene.loads)
+            unknown.xi, problem.sections, tau, balanced, definite, loaded=scene.loaded
         )
         sound = status == Status.CONVERGED
         forces = forces_at(problem.couplings, unknown.coupled, problem.forces)
@@ -140,6 +140,9 @@ class StrainDependent(SteppedModel):
             scene.sections(grid.X),
             state.shares_at(scene, grid, grid.X, forces),
         )
+
+    def loading(self, scene: Scene, state: ArmSolution, grid: Grid) -> Loading | None:
+        return state.loading(super().loading(scene, state, grid))
 
     def coordinates(
         self, scene: Scene, forces: Forces, state: ArmSolution
@@ -177,7 +180,7 @@ class StrainDependent(SteppedModel):
         self, scene: Scene, forces: Forces, state: ArmSolution, X: Float[Array, " stations"]
     ) -> Vector:
         grid = self.grid(scene)
-        loads = loading(scene, grid)
+        loads = self.loading(scene, state, grid)
         reaction = None if loads is None else react_at(state.xi, grid, loads, X)
         tau = shared(forces, state.shares_at(scene, grid, X, forces))
         start = tuple(jnp.interp(X, grid.X.T.reshape(-1), x.T.reshape(-1)) for x in state.xi)

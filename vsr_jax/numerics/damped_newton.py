@@ -36,6 +36,9 @@ contractions below which convergence is quadratic."""
 _CERTAIN, _NEAR = 0.1, 1e-4
 """Contraction of steps and residuals, and size of a step, below which the last step is taken
 without an evaluation after it: what it leaves is then known from the contraction."""
+_SETTLED = 0.05
+"""Size of an undamped step below which springs are replaced by the constraints that they stand
+for."""
 _ACCEPTED = 64
 """Largest accepted residual, in multiples of its rounding level."""
 _MAX_RISES = 3
@@ -109,6 +112,8 @@ def damped_newton(
     floor: Array,
     increments: int = 1,
     origin: Any = None,
+    *,
+    exact: bool = False,
 ) -> Root:
     r"""Root of a residual that is the gradient of an energy, or nearly so, by Newton's method with
     Levenberg damping.
@@ -149,12 +154,15 @@ def damped_newton(
     - `floor`: size of the residual that counts as rounding, one entry per problem.
     - `increments`: number of load increments.
     - `origin`: where the second attempt begins, the start by default.
+    - `exact`: whether the problem has constraints that are springs up to the fraction 1 of the
+      loads. One more increment, once the problem with springs is nearly solved, makes them exact.
 
     **Returns:** a `Root`; it is converged if the residual at the end is rounding or as small as a
     negligible step.
     """
     twice = increments > 1 or origin is not None
     origin = start if origin is None else origin
+    levels = increments + exact
     small = float(jnp.finfo(floor.dtype).eps ** 0.75)
     accepted = jnp.maximum(_ACCEPTED * floor, small)
 
@@ -162,7 +170,7 @@ def damped_newton(
         negligible = (guard.miss < small) | (guard.rises >= _MAX_RISES)
         done = guard.fresh & (guard.damping == 0) & (guard.merit <= accepted) & negligible
         stuck = ~guard.definite & (guard.merit < floor)
-        return ~((done | stuck) & (guard.applied == increments)) & (guard.plain < MAX_PLAIN_STEPS)
+        return ~((done | stuck) & (guard.applied == levels)) & (guard.plain < MAX_PLAIN_STEPS)
 
     def probing(guard: _Guard) -> Array:
         found = ~going(guard) & guard.definite & (guard.merit <= accepted)
@@ -175,7 +183,7 @@ def damped_newton(
         step = _shrunk(step, probe, measures.turn)
         plain = (old.spent >= MAX_DAMPED_STEPS) | (old.damping >= _MAX_DAMPING) | (old.plain > 0)
         trial = jax.tree.map(lambda a, s: jnp.where(old.fresh, a - s.astype(a.dtype), a), x, step)
-        damping, applied = _attempt(old, plain, increments)
+        damping, applied = _attempt(old, plain, increments, levels)
         new = evaluate(trial, jnp.where(probe, _PROBE_DAMPING, damping), applied / increments)
         left = measures.work(new.residual, step)
         taken = _accepted(old, new, left, floor, plain, increments)
@@ -209,7 +217,7 @@ def damped_newton(
 
     careful = first = _careful(floor, increments)
     if twice:
-        whole = jnp.full_like(floor, increments)
+        whole = jnp.full_like(floor, levels)
         first = careful._replace(applied=whole, damping=jnp.zeros_like(floor))
     step = jax.tree.map(
         lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
@@ -267,12 +275,16 @@ def _probed(old: _Guard, probe: Array, ratio: Array) -> _Guard:
     return old._replace(definite=old.definite & ~grown, spent=spent, probes=probes, growth=growth)
 
 
-def _attempt(old: _Guard, plain: Array, increments: int) -> tuple[Array, Array]:
+def _attempt(old: _Guard, plain: Array, increments: int, levels: int) -> tuple[Array, Array]:
     """Damping and load increments of the next evaluation: less and more than before if the last
     step may be tried."""
     damping = jnp.where(old.fresh, _lowered(old.damping), old.damping)
     more = jnp.where(old.fresh, jnp.minimum(old.applied + 1, increments), old.applied)
-    return jnp.where(plain, 0.0, damping), jnp.where(plain, increments, more)
+    if levels > increments:
+        settled = (old.applied >= increments) & (old.damping == 0) & (old.size < _SETTLED)
+        more = jnp.where(old.applied == levels, levels, more)
+        more = jnp.where(old.fresh & settled, levels, more)
+    return jnp.where(plain, 0.0, damping), jnp.where(plain, levels, more)
 
 
 def _accepted(
