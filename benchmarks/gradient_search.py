@@ -170,7 +170,7 @@ def drawn(made: Structure, random: np.random.Generator) -> Drawn:
             )
         )
     actuators, inputs = zip(*threads, strict=True)
-    free = {} if made.free is None else {"free_strains": made.free}
+    free: dict[str, Any] = {} if made.free is None else {"free_strains": made.free}
     scene = vsr.Scene(rod, actuators, _loads(on, arm, density, random), **free)
     return Drawn(scene, jnp.asarray(inputs), EI / (L * arm.radius))
 

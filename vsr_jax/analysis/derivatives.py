@@ -165,7 +165,10 @@ def _compliance(eq: Equilibrium) -> Array:
 def _pushed(eq: Equilibrium, wrench: Float[Array, "6"]) -> Equilibrium:
     """The equilibrium with an additional wrench on the tip."""
     loads = (*eq.scene.loads, TipWrench(wrench[3:], wrench[:3]))
-    scene = Scene(eq.scene.rod, eq.scene.actuators, loads, free_strains=eq.scene.free_strains)
+    old = eq.scene
+    scene = Scene(
+        old.rod, old.actuators, loads, free_strains=old.free_strains, obstacles=old.obstacles
+    )
     return solve(scene, eq.inputs, model=eq.model)
 
 

@@ -1,5 +1,5 @@
-"""Parts of an arm: profiles, sections, materials, routings, actuators, loads, the rod, and the
-scene that combines them.
+"""Parts of an arm: profiles, sections, materials, routings, actuators, loads, the rod, obstacles
+around it, and the scene that combines them.
 
 Data and their geometry only. Must not know how an equilibrium is found or how a scene is stored.
 """
@@ -7,6 +7,7 @@ Data and their geometry only. Must not know how an equilibrium is found or how a
 from .actuator import Actuator, Chamber, Tendon, Thread
 from .loads import DistributedWrench, Frame, Gravity, Load, PointWrench, TipWrench
 from .material import Material
+from .obstacles import Box, Cylinder, Field, Obstacle, Plane, Sphere
 from .placement import pose
 from .pose_loads import (
     MagneticDensity,
@@ -30,17 +31,21 @@ from .routing import Function, Helix, Linear, Parallel, Polynomial, Routing, Spl
 from .scene import CrossSections, Scene
 from .scene_numbers import Parameter, parameters
 from .section import Annular, Circular, Elliptic, Joined, Rectangular, Section
+from .tube import Tube
 
 __all__ = [
     "STRAINS",
     "Actuator",
     "Annular",
+    "Box",
     "Chamber",
     "Circular",
     "Constant",
     "CrossSections",
+    "Cylinder",
     "DistributedWrench",
     "Elliptic",
+    "Field",
     "Frame",
     "Function",
     "FunctionProfile",
@@ -52,10 +57,12 @@ __all__ = [
     "MagneticDensity",
     "MagneticMoment",
     "Material",
+    "Obstacle",
     "Parallel",
     "Parameter",
     "Payload",
     "Piecewise",
+    "Plane",
     "PointWrench",
     "Polynomial",
     "PolynomialProfile",
@@ -66,6 +73,7 @@ __all__ = [
     "Routing",
     "Scene",
     "Section",
+    "Sphere",
     "Spinning",
     "Spline",
     "SplineProfile",
@@ -74,6 +82,7 @@ __all__ = [
     "Tendon",
     "Thread",
     "TipWrench",
+    "Tube",
     "parameters",
     "pose",
 ]

@@ -12,7 +12,7 @@ Both, and their derivatives in the tangent of the arm, come from automatic diffe
 """
 
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -22,6 +22,7 @@ from jaxtyping import Array, Float
 from ..numerics.stacked import cross, dot, matmul, matvec, skew
 from ..typing import ArrayLike, Scalar, Twist, VectorLike
 from ..validation import choice, numbers
+from .functions import Position, function_of_position
 from .loads import THREE_PROFILES, Frame, Load, mass_per_length, need_density
 from .profile import (
     ProfilesLike,
@@ -35,8 +36,7 @@ from .rod import Rod
 Needs = Literal["rotation", "pose"]
 
 Rotation = Float[Array, "3 3"]
-Position = Float[Array, "3"]
-Field = VectorLike | Callable[[Position], ArrayLike]
+FieldLike = VectorLike | Callable[[Position], ArrayLike]
 
 
 class PoseLoad(Load):
@@ -246,23 +246,10 @@ class _Magnetic(PoseLoad):
         return jnp.asarray(self.field(position) if callable(self.field) else self.field)
 
 
-def _field(name: str, field: Field) -> Array | Callable:
+def _field(name: str, field: FieldLike) -> Array | Callable:
     if not callable(field):
         return numbers(name, field, (3,))
-    whole: Any = field  # a module has numbers that are differentiable
-    return whole if isinstance(field, eqx.Module) else _FieldOf(field)
-
-
-class _FieldOf(eqx.Module):
-    """A field as a function of the position, which returns three numbers."""
-
-    function: Callable = eqx.field(static=True)
-
-    def __call__(self, position: Position) -> ArrayLike:
-        return self.function(position)
-
-    def __repr__(self) -> str:
-        return f"{getattr(self.function, '__name__', 'function')}(r)"
+    return function_of_position(field)
 
 
 class MagneticMoment(_Magnetic, _AtPoint):
@@ -280,7 +267,7 @@ class MagneticMoment(_Magnetic, _AtPoint):
     X: Scalar | None = eqx.field(metadata={"unit": "m"})
     effect = "magnetic moment"
 
-    def __init__(self, moment: VectorLike, field: Field, X: ArrayLike | None = None):
+    def __init__(self, moment: VectorLike, field: FieldLike, X: ArrayLike | None = None):
         self.moment = numbers("MagneticMoment.moment", moment, (3,))
         self.field = _field("MagneticMoment.field", field)
         self.X = _abscissa("MagneticMoment.X", X)
@@ -304,7 +291,7 @@ class MagneticDensity(_Magnetic):
     field: Array | Callable = eqx.field(metadata={"unit": "T"})
     effect = "magnetic density"
 
-    def __init__(self, moment: ProfilesLike, field: Field):
+    def __init__(self, moment: ProfilesLike, field: FieldLike):
         name = "MagneticDensity.moment"
         self.moment = as_profiles(name, moment, [f"{name}[{i}]" for i in range(3)], THREE_PROFILES)
         self.field = _field("MagneticDensity.field", field)

@@ -119,6 +119,12 @@ class Rod(Part):
             else jnp.maximum(inside, self.guide_radius - norm((y, z)))
         )
 
+    def outline(self, X: Scalar) -> Scalar:
+        """Radius [m] of the round outline of the arm about its axis at X: that of the section, of
+        its corners where it is not round, or `guide_radius` if that is greater."""
+        radius = self.section.outer_radius(X, self.length)
+        return radius if self.guide_radius is None else jnp.maximum(radius, self.guide_radius)
+
     @property
     def breakpoints(self) -> tuple[Scalar, ...]:
         """Abscissas [m] where a size, a material property, the rest strain or one of their

@@ -13,15 +13,16 @@ from jaxtyping import Array, Bool, Float
 from ..numerics.component import Forces, Vector, Wrench, add, dot
 from ..numerics.quadrature import make_grid, piece_edges
 from ..typing import ArrayLike, DTypeLike, Scalar, VectorLike, cast
-from ..validation import ROUNDING, concrete, instance, is_traced, numbers, precise
+from ..validation import concrete, instance, is_traced, numbers, precise
 from .actuator import Actuator
 from .description import Part, describe, described_arguments, table
 from .held import Held
 from .loads import Frame, Load
+from .obstacles import Obstacle
 from .pose_loads import PoseLoad
-from .profile import Limits
 from .rod import STRAINS, Rod
 from .routing import Path, thread_tangent
+from .scene_checks import check_held, check_numbers, check_obstacles
 from .scene_numbers import checked_values, replaced
 
 
@@ -57,6 +58,7 @@ class Scene(Part):
     - `free_strains`: names of the strains that can change, all six by default. The others equal
       their rest value and are not unknowns of the solve. `("bending_y", "bending_z")` is an
       inextensible rod without twist and shear.
+    - `obstacles`: `Plane`, `Sphere`, `Cylinder`, `Box`, `Tube` and `Field`, rigid and fixed.
 
     **Raises:** `ValueError` if
 
@@ -64,7 +66,9 @@ class Scene(Part):
     - a size, a modulus, a density or the rest elongation is not positive somewhere,
     - a tube has no wall, or Poisson's ratio is out of its range,
     - a thread ends or a load acts beyond the arm,
-    - there is gravity and the material has no density.
+    - there is gravity and the material has no density,
+    - an obstacle has no size, a tube is narrower than the arm, or the arm is inside an obstacle at
+      rest or starts outside a tube.
 
     Only known numbers are checked, not those traced by `jax.jit`.
     """
@@ -74,6 +78,7 @@ class Scene(Part):
     loads: tuple[Load, ...]
     held: tuple[Held, ...]
     free_strains: tuple[str, ...] = eqx.field(static=True)
+    obstacles: tuple[Obstacle, ...]
 
     def __init__(
         self,
@@ -83,6 +88,7 @@ class Scene(Part):
         *,
         held: Sequence[Held] | Held = (),
         free_strains: Sequence[str] = STRAINS,
+        obstacles: Sequence[Obstacle] | Obstacle = (),
     ):
         self.rod = instance("Scene.rod", rod, Rod, "a Rod")
         self.actuators = _each(
@@ -96,6 +102,9 @@ class Scene(Part):
                 f"Scene.free_strains: got {free_strains!r}, need some of {', '.join(STRAINS)}"
             )
         self.free_strains = tuple(name for name in STRAINS if name in names)
+        self.obstacles = _each(
+            "Scene.obstacles", obstacles, Obstacle, "a Plane, Sphere, Tube or other obstacle"
+        )
         for load in self.loads:
             load.check(rod)
         self._check_numbers()
@@ -103,7 +112,7 @@ class Scene(Part):
     def __repr__(self) -> str:
         rod = described_arguments(self.rod) if isinstance(self.rod, Part) else []
         rows = [(f"rod.{name}", text) for name, text in rod] or [("rod", describe(self.rod))]
-        for name in ("actuators", "loads", "held"):
+        for name in ("actuators", "loads", "held", "obstacles"):
             parts = getattr(self, name)
             if isinstance(parts, tuple):
                 rows += [(f"{name}[{i}]", _line(part)) for i, part in enumerate(parts)]
@@ -120,6 +129,7 @@ class Scene(Part):
         loads = [load.effects for load in self.loads]
         names = [effects[0] for effects in (*threads, *loads)]
         names += [held.effect for held in self.held]
+        names += [obstacle.effect for obstacle in self.obstacles]
         names += [option for effects in loads for option in effects[1:]]
         names += ["sections"] if self.breakpoints else []
         names += [option for effects in threads for option in effects[1:]]
@@ -144,14 +154,15 @@ class Scene(Part):
 
     @property
     def coupled(self) -> bool:
-        """Whether the cross-sections depend on each other: through loads, held sections, given
-        thread lengths or friction."""
+        """Whether the cross-sections depend on each other: through loads, held sections, obstacles,
+        given thread lengths or friction."""
         return bool(self.loaded or self.length_driven or self.frictional)
 
     @property
     def loaded(self) -> bool:
-        """Whether anything but the threads exerts wrenches on the arm: loads and held sections."""
-        return bool(self.loads or self.held)
+        """Whether anything but the threads exerts wrenches on the arm: loads, held sections and
+        obstacles."""
+        return bool(self.loads or self.held or self.obstacles)
 
     @property
     def breakpoints(self) -> tuple[Scalar, ...]:
@@ -308,66 +319,10 @@ class Scene(Part):
         return cast(self, dtype)
 
     def _check_numbers(self) -> None:
-        if any(is_traced(leaf) for leaf in jax.tree.leaves(self)):
-            return
-        length = float(numbers("Scene.rod.length", self.rod.length, positive=True))
-        self._check_places(length)
-        probe = jax.tree.map(concrete, _probe(self))
-        if probe[0] is None:
-            return
-        X, limited, clearances = probe
-        for (name, needed), (values, room) in limited.items():
-            if not np.all(room > 0):
-                i, unit = int(np.argmin(room)), " m" if name.startswith("section") else ""
-                raise ValueError(
-                    f"Scene.rod.{name}: got {values[i]:g}{unit} at X = {X[i]:g} m, need {needed} "
-                    f"everywhere"
-                )
-        for i, values in enumerate(clearances):
-            j = int(np.argmin(values))
-            if not values[j] > -ROUNDING * length:
-                guide = self.rod.guide_radius
-                outside, needed = (
-                    ("section", "the section (or give the rod a guide_radius)")
-                    if guide is None
-                    else ("section and the guides", f"the guide_radius of {float(guide):g} m")
-                )
-                raise ValueError(
-                    f"Scene.actuators[{i}].routing: the thread is {-values[j]:.3g} m outside the "
-                    f"{outside} at X = {X[j]:g} m; need a path inside {needed}"
-                )
-
-    def _check_places(self, length: float) -> None:
-        """Raises `ValueError` if a thread end, a point load or a held section is beyond the arm,
-        or a section is held twice."""
-        beyond = length * (1 + ROUNDING)
-        for i, actuator in enumerate(self.actuators):
-            for name, x in (("start", actuator.start), ("end", actuator.end)):
-                if x is not None and (
-                    float(x) > beyond or (name == "start" and float(x) >= length)
-                ):
-                    raise ValueError(
-                        f"Scene.actuators[{i}].{name}: got {float(x):g} m, need a place on the "
-                        f"arm of {length:g} m"
-                    )
-        for i, load in enumerate(self.loads):
-            X = load.place(self.rod)
-            if X is not None and float(X) > beyond:
-                raise ValueError(
-                    f"Scene.loads[{i}].X: got {float(X):g} m, need a place on the arm of "
-                    f"{length:g} m"
-                )
-        places = [float(held.place(self.rod)) for held in self.held]
-        for i, X in enumerate(places):
-            if X > beyond:
-                raise ValueError(
-                    f"Scene.held[{i}].X: got {X:g} m, need a place on the arm of {length:g} m"
-                )
-            if X in places[:i]:
-                raise ValueError(
-                    f"Scene.held[{i}].X: got {X:g} m, which Scene.held[{places.index(X)}] holds "
-                    f"already, need one Held per section"
-                )
+        if not any(is_traced(leaf) for leaf in jax.tree.leaves(self)):
+            check_numbers(self.rod, self.actuators, self.loads, self.edges)
+            check_held(self.rod, self.held)
+            check_obstacles(self.rod, self.obstacles, self.edges)
 
 
 def _line(part: Any) -> str:
@@ -386,30 +341,3 @@ def _rest_length(scene: Scene, place: int) -> Scalar:
     sections = scene.sections(grid.X)
     t_c, reach = thread_tangent(sections.rest, sections.paths[place]), sections.reach[place]
     return jnp.sum(grid.weight * jnp.sqrt(dot(t_c, t_c)) * (1.0 if reach is None else reach))
-
-
-_PROBES = 65
-"""Evenly spaced abscissas at which limits are checked, besides the breakpoints and the middles
-between them."""
-
-
-@eqx.filter_jit
-def _probe(scene: Scene) -> tuple[Array, Limits, list[Array]]:
-    """Abscissas X [m] along the arm and, at each, the numbers of the rod that have limits and the
-    clearance of each thread [m]."""
-    rod = scene.rod
-    # between the breakpoints too, where a short piece may lie between evenly spaced abscissas
-    edges = scene.edges()
-    X = jnp.concatenate(
-        [jnp.linspace(0, 1, _PROBES) * rod.length, edges, 0.5 * (edges[1:] + edges[:-1])]
-    )
-
-    def clearance(actuator: Actuator, x: Scalar) -> Array:
-        inside, reach = rod.clearance(*actuator.routing(x), x), actuator.reach(x)
-        return inside if reach is None else jnp.where(reach > 0, inside, jnp.inf)
-
-    return (
-        X,
-        jax.vmap(rod.limits)(X),
-        [jax.vmap(lambda x, a=a: clearance(a, x))(X) for a in scene.actuators],
-    )

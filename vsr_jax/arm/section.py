@@ -56,6 +56,10 @@ class Section(Part):
         """Points (y, z) [m] of the outer wall at X, a closed curve for `angle` [rad] from 0 (on the
         y axis) to 2 pi."""
 
+    @abstractmethod
+    def outer_radius(self, X: Scalar, length: Scalar) -> Scalar:
+        """Distance [m] from the axis to the farthest point of the outer wall at X."""
+
     def inner_radius(self, X: Scalar, length: Scalar) -> Scalar:
         """Radius [m] of the central hole at X, 0 for a solid section."""
         return jnp.zeros_like(X)
@@ -126,6 +130,9 @@ class Circular(Section):
         r = self.radius(X, length)
         return r * jnp.cos(angle), r * jnp.sin(angle)
 
+    def outer_radius(self, X: Scalar, length: Scalar) -> Scalar:
+        return self.radius(X, length)
+
     @property
     def sizes(self) -> dict[str, Profile]:
         return {"radius": self.radius}
@@ -167,6 +174,9 @@ class Annular(Section):
     def outline(self, angle: Array, X: Scalar, length: Scalar) -> tuple[Array, Array]:
         r = self.outer(X, length)
         return r * jnp.cos(angle), r * jnp.sin(angle)
+
+    def outer_radius(self, X: Scalar, length: Scalar) -> Scalar:
+        return self.outer(X, length)
 
     def inner_radius(self, X: Scalar, length: Scalar) -> Scalar:
         return self.inner(X, length)
@@ -228,6 +238,9 @@ class Rectangular(Section):
             X, length
         ) / 2 * sine / square
 
+    def outer_radius(self, X: Scalar, length: Scalar) -> Scalar:
+        return 0.5 * norm((self.width(X, length), self.height(X, length)))
+
     @property
     def sizes(self) -> dict[str, Profile]:
         return {"width": self.width, "height": self.height}
@@ -287,6 +300,9 @@ class Elliptic(Section):
             angle
         )
 
+    def outer_radius(self, X: Scalar, length: Scalar) -> Scalar:
+        return jnp.maximum(self.semi_axis_y(X, length), self.semi_axis_z(X, length))
+
     @property
     def sizes(self) -> dict[str, Profile]:
         return {"semi_axis_y": self.semi_axis_y, "semi_axis_z": self.semi_axis_z}
@@ -318,6 +334,9 @@ class Joined(Section):
 
     def outline(self, angle: Array, X: Scalar, length: Scalar) -> tuple[Array, Array]:
         return pick(X, self.ends, [section.outline(angle, X, length) for section in self.sections])
+
+    def outer_radius(self, X: Scalar, length: Scalar) -> Scalar:
+        return pick(X, self.ends, [section.outer_radius(X, length) for section in self.sections])
 
     def inner_radius(self, X: Scalar, length: Scalar) -> Scalar:
         return pick(X, self.ends, [section.inner_radius(X, length) for section in self.sections])

@@ -35,7 +35,12 @@ def spline_value(X: Scalar, points: Points, values: Points) -> Scalar:
     Two points give the straight line and three the parabola through them. The first and the last
     piece extend beyond the end points.
     """
-    slopes = _slopes(points, values)
+    return hermite_value(X, points, values, spline_slopes(points, values))
+
+
+def hermite_value(X: Scalar, points: Points, values: Array, slopes: Array) -> Array:
+    """Value at X [m] of the cubic pieces with given values and derivatives at the abscissas
+    `points` [m]; of shape (points,), or (points, components) for a curve."""
     i = jnp.clip(jnp.searchsorted(points, X, side="right") - 1, 0, points.size - 2)
     h = points[i + 1] - points[i]
     s = (X - points[i]) / h
@@ -44,7 +49,7 @@ def spline_value(X: Scalar, points: Points, values: Points) -> Scalar:
     return values[i] + h * s * (d0 + s * ((3 * secant - 2 * d0 - d1) + s * (d0 + d1 - 2 * secant)))
 
 
-def _slopes(points: Points, values: Points) -> Points:
+def spline_slopes(points: Points, values: Points) -> Points:
     """Derivatives of the spline at its points."""
     x, h = points, jnp.diff(points)
     secant = jnp.diff(values) / h

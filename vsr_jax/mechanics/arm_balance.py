@@ -17,6 +17,7 @@ from ..numerics.quadrature import Grid
 from ..numerics.stacked import components
 from .balance import free_components, residual
 from .cable import lengths_of
+from .contact import contacts_of
 from .coupling import ArmProblem, ArmState, Carried, Coupling, Shares, forces_at, loads_with
 from .friction import friction_of
 from .held import holds_of
@@ -66,6 +67,7 @@ def couplings_of(scene: Scene, inputs: Array, problem: ArmProblem) -> tuple[Coup
         lengths_of(scene, inputs, sections, grid),
         friction_of(scene, grid),
         holds_of(scene, sections, grid),
+        contacts_of(scene, sections, grid),
     )
     return tuple(coupling for coupling in found if coupling is not None)
 

@@ -65,15 +65,16 @@ def approximate_solve(
         return eliminate(lower, b, along, slopes, grid, free)
 
     strain, (negative, doubtful) = solve(spread(right.wrench, free))
-    places, border = borders_of(problem, unknown.coupled, at)
+    borders, border = borders_of(problem, unknown.coupled, at)
     if border is None:
         return ArmUnknown(strain, right.coupled), negative == 0, doubtful
-    rows = jnp.concatenate([right.coupled[place] for place in places])
+    parts = [one.part(right.coupled[place]) for place, one in borders.items()]
+    rows = jnp.concatenate(parts)
     strain, x, held = bordered_solve(lambda b: solve(b)[0], strain, rows, border, grid)
     coupled, first = list(right.coupled), 0
-    for place in places:
-        last = first + len(right.coupled[place])
-        coupled[place], first = x[first:last], last
+    for (place, one), part in zip(borders.items(), parts, strict=True):
+        last = first + len(part)
+        coupled[place], first = one.whole(x[first:last], right.coupled[place]), last
     return ArmUnknown(strain, tuple(coupled)), negative == held, doubtful
 
 

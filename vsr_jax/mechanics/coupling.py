@@ -111,12 +111,27 @@ class Border(NamedTuple):
     - `rows`: R, for each row a wrench at the nodes; its work over a change of strain, times the
       factor, is the change of the row.
     - `factors`: F, shape (m, ...). `corner`: the diagonal of D, shape (m, ...).
+    - `chosen`: places among the unknowns to which the border belongs, shape (m, ...), None for all;
+      the others have the tangent 1.
     """
 
     columns: Vector
     rows: Vector
     factors: Array
     corner: Array
+    chosen: Array | None = None
+
+    def part(self, rows: Array) -> Array:
+        """The rows that the border has."""
+        return rows if self.chosen is None else jnp.take_along_axis(rows, self.chosen, axis=0)
+
+    def whole(self, x: Array, rows: Array) -> Array:
+        """All unknowns from those of the border and the rows of the others."""
+        if self.chosen is None:
+            return x
+        place = jnp.arange(len(rows)).reshape(-1, 1, *(1,) * (rows.ndim - 1)) == self.chosen[None]
+        found = jnp.sum(jnp.where(place, x[None], 0.0), axis=1)
+        return jnp.where(jnp.any(place, axis=1), found, rows)
 
 
 class Coupling(eqx.Module):
@@ -238,17 +253,17 @@ def loads_with(
 
 def borders_of(
     problem: ArmProblem, unknowns: tuple, at: ArmState
-) -> tuple[tuple[int, ...], Border | None]:
-    """Which couplings have a border, and all borders as one; None if there is none."""
+) -> tuple[dict[int, Border], Border | None]:
+    """The borders by the places of their couplings, and all as one; None if there is none."""
     each = [
         coupling.border(x, at, note, problem)
         for coupling, x, note in zip(problem.couplings, unknowns, at.notes, strict=True)
     ]
-    found = [border for border in each if border is not None]
-    places = tuple(i for i, border in enumerate(each) if border is not None)
+    found = {i: border for i, border in enumerate(each) if border is not None}
     if not found:
-        return places, None
-    return places, jax.tree.map(lambda *parts: _listed(parts), *found)
+        return found, None
+    apart = [border._replace(chosen=None) for border in found.values()]
+    return found, jax.tree.map(lambda *parts: _listed(parts), *apart)
 
 
 def _listed(parts: tuple[Array, ...]) -> Array:

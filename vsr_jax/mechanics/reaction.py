@@ -47,6 +47,7 @@ from ..numerics.stacked import (
     turned,
 )
 from .pose_terms import PoseTerm, finite, pose_terms
+from .touch import Surroundings, Touch, at_ends, contact_forces, touch_of
 
 
 class FollowerPoint(NamedTuple):
@@ -67,6 +68,7 @@ class Loading(NamedTuple):
     - `follower_density`: $(c, f)$ in the body frame; `follower_points`: wrenches at points in the
       body frame;
     - `by_pose`: loads that depend on the pose of their section;
+    - `around`: the obstacles and the contact forces;
     - `base`: pose of the base, the identity for None.
     """
 
@@ -76,12 +78,13 @@ class Loading(NamedTuple):
     follower_points: tuple[FollowerPoint, ...]
     by_pose: tuple[PoseTerm, ...]
     base: Array | None
+    around: Surroundings | None = None
 
     @property
     def motion(self) -> int:
         """Size of the motions of sections by which wrenches in the world frame change: 0 for dead
         loads, 3 (rotation) or 6 (and displacement)."""
-        if any(term.load.needs == "pose" for term in self.by_pose):
+        if self.around is not None or any(term.load.needs == "pose" for term in self.by_pose):
             return 6
         turns = self.by_pose or self.follower_points or self.follower_density is not None
         return 3 if turns else 0
@@ -125,6 +128,7 @@ class Reaction(NamedTuple):
       points (6,) and the follower density.
     - `body_density`: density (c, f) of all loads in the body frame.
     - `seen`: rotation and position where each load acts that depends on the pose.
+    - `touch`: the contacts.
     """
 
     starts: Array
@@ -138,6 +142,7 @@ class Reaction(NamedTuple):
     follower: Array | None
     body_density: Array
     seen: tuple[tuple[Array, Array | None], ...]
+    touch: Touch | None
 
 
 class PointSlope(NamedTuple):
@@ -151,14 +156,18 @@ class PointSlope(NamedTuple):
 
 class Slopes(NamedTuple):
     """Derivatives of the loads in the world frame with respect to motions of their sections: of the
-    density (6, motion, stages, steps), None if it is constant, and of the wrenches at points."""
+    density (6, motion, stages, steps), None if it is constant, of the wrenches at points, and of
+    those at the ends of the steps (6, motion, steps), None if there are none."""
 
     density: Array | None
     points: tuple[PointSlope, ...]
+    ends: Array | None = None
 
     @property
     def motion(self) -> int:
         """Size of the motions, see `Loading.motion`."""
+        if self.ends is not None:
+            return 6
         matrices = [x for x in (self.density, *(p.matrix for p in self.points)) if x is not None]
         return matrices[0].shape[1] if matrices else 0
 
@@ -256,11 +265,15 @@ def react(xi: Vector, grid: Grid, loads: Loading) -> Reaction:
             world = world + beyond(here, grid)
         else:
             world = world + term.before * here[:, None, None]
+    touch = None if loads.around is None else touch_of(axis, grid, loads.around)
+    if touch is not None:
+        pushed = contact_forces(touch)
+        world = world + jnp.concatenate([jnp.zeros_like(pushed), pushed])
     arm = cross(axis, rows(world, 3, 6))
     world, density = _with_moment(world, beyond(arm, grid)), _with_moment(density, arm)
     wrench = turned(back, world)
     return Reaction(
-        starts, end, R, world, density, wrench, axis, points, follower, body_density, seen
+        starts, end, R, world, density, wrench, axis, points, follower, body_density, seen, touch
     )
 
 
@@ -299,7 +312,8 @@ def slopes_of(along: Reaction, loads: Loading) -> Slopes:
             points.append(PointSlope(term.step, term.before, here))
         else:
             density = here if density is None else density + here
-    return Slopes(density, tuple(points))
+    ends = None if along.touch is None else at_ends(along.touch)
+    return Slopes(density, tuple(points), ends)
 
 
 def _turning(wrench: Array, size: int) -> Array:

@@ -1,0 +1,217 @@
+r"""Rigid, fixed obstacles around an arm, each defined by its signed distance.
+
+The distance $d(r)$ [m] from the surface of an obstacle to a point of the world is positive where
+the arm may be and negative inside the obstacle. Its gradient is the unit normal of the surface, and
+its second derivatives are the curvatures; both come from automatic differentiation and are finite
+everywhere, also at centres, on axes and on edges, where the normal is not unique. The arm touches
+an obstacle where the distance of its axis is the radius of its outline, `Rod.outline`.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..numerics.component import norm, split
+from ..numerics.stacked import matvec, transpose
+from ..typing import ArrayLike, MatrixLike, Pose, Scalar, VectorLike
+from ..validation import concrete, numbers, rigid
+from .description import Part
+from .functions import Position, function_of_position
+from .rod import Rod
+
+
+class Obstacle(Part):
+    """A rigid obstacle fixed in the world. One that `encloses` the arm is a lumen: the arm must
+    start inside it, and elsewhere may be beyond its wall at rest."""
+
+    effect: eqx.AbstractClassVar[str]
+    encloses: ClassVar[bool] = False
+
+    @abstractmethod
+    def distance(self, point: Position) -> Scalar:
+        """Signed distance [m] from the surface to a point of the world: positive outside, where the
+        arm may be. One point at a time; for several use `jax.vmap`."""
+
+    @property
+    def sizes(self) -> dict[str, Array]:
+        """The numbers that must be positive, by name."""
+        return {}
+
+    def check(self, name: str, rod: Rod, X: Float[Array, " stations"]) -> None:
+        """Raises `ValueError` if `rod` has no room, for known numbers.
+
+        **Arguments:** `name`: the obstacle's name in messages; `X`: stations along the rod [m].
+        """
+
+
+def local_point(pose: Pose | None, point: Position) -> Position:
+    """A point of the world in the axes of a pose, $R^T (p - r)$; None is the identity."""
+    return point if pose is None else matvec(transpose(pose[:3, :3]), point - pose[:3, 3])
+
+
+def _pose(name: str, pose: MatrixLike | None) -> Pose | None:
+    return None if pose is None else rigid(name, pose)
+
+
+def _distance_beyond(over: Float[Array, " sides"]) -> Scalar:
+    """Distance to a box, or to what it is a section of, from the components by which a point is
+    beyond each pair of its sides."""
+    outside = jnp.where(over > 0, over, 0.0)
+    return jnp.where(jnp.all(over <= 0), jnp.max(over), norm(split(outside)))
+
+
+class Plane(Obstacle):
+    r"""The half space behind a plane, $d = n \cdot (r - p)$ with the unit normal $n$.
+
+    **Arguments:**
+    - `normal`: a vector of any length that points to the side where the arm may be.
+    - `point`: $p$ [m], a point of the plane, the origin by default.
+    """
+
+    normal: Float[Array, "3"] = eqx.field(metadata={"unit": "-"})
+    point: Position = eqx.field(metadata={"unit": "m"})
+    effect = "plane"
+
+    def __init__(self, normal: VectorLike, point: VectorLike = (0.0, 0.0, 0.0)):
+        self.normal = numbers("Plane.normal", normal, (3,))
+        self.point = numbers("Plane.point", point, (3,))
+        known = concrete(self.normal)
+        if known is not None and not known.any():
+            raise ValueError(f"Plane.normal: got {normal!r}, need a direction, not zeros")
+
+    def distance(self, point: Position) -> Scalar:
+        return jnp.sum(self.normal * (point - self.point)) / norm(split(self.normal))
+
+    @property
+    def sizes(self) -> dict[str, Array]:
+        return {"normal": norm(split(self.normal))}
+
+
+class Sphere(Obstacle):
+    r"""A ball, $d = |r - c| - R$.
+
+    **Arguments:** `centre`: $c$ [m], shape (3,); `radius`: $R$ [m].
+    """
+
+    centre: Position = eqx.field(metadata={"unit": "m"})
+    radius: Scalar = eqx.field(metadata={"unit": "m"})
+    effect = "sphere"
+
+    def __init__(self, centre: VectorLike, radius: ArrayLike):
+        self.centre = numbers("Sphere.centre", centre, (3,))
+        self.radius = numbers("Sphere.radius", radius, positive=True)
+
+    def distance(self, point: Position) -> Scalar:
+        return norm(split(point - self.centre)) - self.radius
+
+    @property
+    def sizes(self) -> dict[str, Array]:
+        return {"radius": self.radius}
+
+
+class Cylinder(Obstacle):
+    """A solid cylinder about the x axis of its pose.
+
+    **Arguments:**
+    - `radius`: [m].
+    - `length`: [m], half of it on each side of the pose's origin; endless by default.
+    - `pose`: of shape (4, 4), as from `vsr_jax.pose`; the identity by default.
+    """
+
+    radius: Scalar = eqx.field(metadata={"unit": "m"})
+    length: Scalar | None = eqx.field(metadata={"unit": "m"})
+    pose: Pose | None = eqx.field(metadata={"unit": "-"})
+    effect = "cylinder"
+
+    def __init__(
+        self,
+        radius: ArrayLike,
+        *,
+        length: ArrayLike | None = None,
+        pose: MatrixLike | None = None,
+    ):
+        self.radius = numbers("Cylinder.radius", radius, positive=True)
+        self.length = None if length is None else numbers("Cylinder.length", length, positive=True)
+        self.pose = _pose("Cylinder.pose", pose)
+
+    def distance(self, point: Position) -> Scalar:
+        x, y, z = split(local_point(self.pose, point))
+        around = norm((y, z)) - self.radius
+        if self.length is None:
+            return around
+        return _distance_beyond(jnp.stack([around, jnp.abs(x) - 0.5 * self.length]))
+
+    @property
+    def sizes(self) -> dict[str, Array]:
+        return {"radius": self.radius} | ({} if self.length is None else {"length": self.length})
+
+
+class Box(Obstacle):
+    """A cuboid whose centre and axes are those of its pose.
+
+    **Arguments:**
+    - `size`: its three sides [m], along x, y and z of the pose.
+    - `pose`: of shape (4, 4), as from `vsr_jax.pose`; the identity by default.
+    - `rounding`: radius of its edges and corners [m], within `size`; sharp by default.
+    """
+
+    size: Float[Array, "3"] = eqx.field(metadata={"unit": "m"})
+    pose: Pose | None = eqx.field(metadata={"unit": "-"})
+    rounding: Scalar = eqx.field(metadata={"unit": "m"})
+    effect = "box"
+
+    def __init__(
+        self,
+        size: VectorLike,
+        *,
+        pose: MatrixLike | None = None,
+        rounding: ArrayLike = 0.0,
+    ):
+        self.size = numbers("Box.size", size, (3,), positive=True)
+        self.pose = _pose("Box.pose", pose)
+        known = concrete(self.size)
+        most = jnp.inf if known is None else float(known.min()) / 2
+        self.rounding = numbers("Box.rounding", rounding, least=0.0, most=most)
+
+    def distance(self, point: Position) -> Scalar:
+        inner = 0.5 * self.size - self.rounding
+        return _distance_beyond(jnp.abs(local_point(self.pose, point)) - inner) - self.rounding
+
+    @property
+    def sizes(self) -> dict[str, Array]:
+        return {"size": jnp.min(self.size)}
+
+
+class Field(Obstacle):
+    """An obstacle of any shape, given by a signed distance.
+
+    **Arguments:** `function`: of a position [m], shape (3,), that returns the distance [m], written
+    with `jax.numpy` and twice differentiable near the surface. The numbers of an equinox module are
+    differentiable. A function that is not a distance, such as the value of a level set, must be
+    divided by the length of its gradient.
+
+    **Raises:** `ValueError` for a function that does not return one number.
+    """
+
+    function: Callable
+    effect = "distance field"
+
+    def __init__(self, function: Callable[[Position], ArrayLike]):
+        if not callable(function):
+            raise ValueError(f"Field.function: got {function!r}, need a function of the position")
+        self.function = function_of_position(function)
+        shapes = [x.shape for x in jax.tree.leaves(jax.eval_shape(function, jnp.zeros(3)))]
+        if shapes != [()]:
+            found = shapes[0] if len(shapes) == 1 else f"{len(shapes)} arrays"
+            raise ValueError(
+                f"Field.function: got a function that returns "
+                f"{f'shape {found}' if len(shapes) == 1 else found}, need a scalar"
+            )
+
+    def distance(self, point: Position) -> Scalar:
+        return jnp.asarray(self.function(point), point.dtype)

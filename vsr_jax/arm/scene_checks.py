@@ -1,0 +1,177 @@
+"""Checks of the known numbers of a scene: sizes and properties, the paths of threads, places on the
+arm, and the room that obstacles leave to the arm at rest."""
+
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..numerics.magnus import step_poses
+from ..numerics.quadrature import make_grid
+from ..typing import Scalar
+from ..validation import ROUNDING, concrete, numbers
+from .actuator import Actuator
+from .held import Held
+from .loads import Load
+from .obstacles import Obstacle
+from .profile import Limits
+from .rod import Rod
+
+_PROBES = 65
+"""Evenly spaced abscissas at which limits are checked, besides the breakpoints and the middles
+between them."""
+_STEPS = 64
+"""Steps along the arm at rest, at whose ends the room is checked."""
+
+
+def check_numbers(
+    rod: Rod,
+    actuators: Sequence[Actuator],
+    loads: Sequence[Load],
+    edges: Callable[[], Float[Array, " edges"]],
+) -> None:
+    """Raises `ValueError` for a size or a property beyond its limits, a thread outside the section,
+    and a thread end or a load beyond the arm.
+
+    **Arguments:** `edges`: function that returns the ends of the smooth pieces of the arm [m]; it
+    is called after the check of the length.
+    """
+    length = float(numbers("Scene.rod.length", rod.length, positive=True))
+    _check_places(length, rod, actuators, loads)
+    probe = jax.tree.map(concrete, _probe(rod, tuple(actuators), edges()))
+    if probe[0] is None:
+        return
+    X, limited, clearances = probe
+    for (name, needed), (values, room) in limited.items():
+        if not np.all(room > 0):
+            i, unit = int(np.argmin(room)), " m" if name.startswith("section") else ""
+            raise ValueError(
+                f"Scene.rod.{name}: got {values[i]:g}{unit} at X = {X[i]:g} m, need {needed} "
+                f"everywhere"
+            )
+    for i, values in enumerate(clearances):
+        j = int(np.argmin(values))
+        if not values[j] > -ROUNDING * length:
+            guide = rod.guide_radius
+            outside, needed = (
+                ("section", "the section (or give the rod a guide_radius)")
+                if guide is None
+                else ("section and the guides", f"the guide_radius of {float(guide):g} m")
+            )
+            raise ValueError(
+                f"Scene.actuators[{i}].routing: the thread is {-values[j]:.3g} m outside the "
+                f"{outside} at X = {X[j]:g} m; need a path inside {needed}"
+            )
+
+
+def _check_places(
+    length: float, rod: Rod, actuators: Sequence[Actuator], loads: Sequence[Load]
+) -> None:
+    """Raises `ValueError` if a thread end or a point load is beyond the arm."""
+    beyond = length * (1 + ROUNDING)
+    for i, actuator in enumerate(actuators):
+        for name, x in (("start", actuator.start), ("end", actuator.end)):
+            if x is not None and (float(x) > beyond or (name == "start" and float(x) >= length)):
+                raise ValueError(
+                    f"Scene.actuators[{i}].{name}: got {float(x):g} m, need a place on the "
+                    f"arm of {length:g} m"
+                )
+    for i, load in enumerate(loads):
+        X = load.place(rod)
+        if X is not None and float(X) > beyond:
+            raise ValueError(
+                f"Scene.loads[{i}].X: got {float(X):g} m, need a place on the arm of {length:g} m"
+            )
+
+
+def check_held(rod: Rod, held: Sequence[Held]) -> None:
+    """Raises `ValueError` if a held section is beyond the arm or is held twice."""
+    length, places = float(rod.length), [float(one.place(rod)) for one in held]
+    for i, X in enumerate(places):
+        if length * (1 + ROUNDING) < X:
+            raise ValueError(
+                f"Scene.held[{i}].X: got {X:g} m, need a place on the arm of {length:g} m"
+            )
+        if X in places[:i]:
+            raise ValueError(
+                f"Scene.held[{i}].X: got {X:g} m, where Scene.held[{places.index(X)}] holds the arm "
+                f"already; need one Held per section"
+            )
+
+
+@eqx.filter_jit
+def _probe(
+    rod: Rod, actuators: tuple[Actuator, ...], edges: Array
+) -> tuple[Array, Limits, list[Array]]:
+    """Abscissas X [m] along the arm and, at each, the numbers of the rod that have limits and the
+    clearance of each thread [m]."""
+    # between the breakpoints too, where a short piece may lie between evenly spaced abscissas
+    X = jnp.concatenate(
+        [jnp.linspace(0, 1, _PROBES) * rod.length, edges, 0.5 * (edges[1:] + edges[:-1])]
+    )
+
+    def clearance(actuator: Actuator, x: Scalar) -> Array:
+        inside, reach = rod.clearance(*actuator.routing(x), x), actuator.reach(x)
+        return inside if reach is None else jnp.where(reach > 0, inside, jnp.inf)
+
+    return (
+        X,
+        jax.vmap(rod.limits)(X),
+        [jax.vmap(lambda x, a=a: clearance(a, x))(X) for a in actuators],
+    )
+
+
+def check_obstacles(
+    rod: Rod, obstacles: Sequence[Obstacle], edges: Callable[[], Float[Array, " edges"]]
+) -> None:
+    """Raises `ValueError` for an obstacle of no size, a tube narrower than the arm, and an arm that
+    at rest is inside an obstacle, or starts outside a tube, for known numbers.
+
+    **Arguments:** `edges`: as for `check_numbers`.
+    """
+    if not obstacles:
+        return
+    X, positions, radii = jax.tree.map(concrete, _at_rest(rod, edges()))
+    if X is None:
+        return
+    for i, obstacle in enumerate(obstacles):
+        name = f"Scene.obstacles[{i}]"
+        for size, value in obstacle.sizes.items():
+            known = concrete(value)
+            if known is not None and not known > 0:
+                raise ValueError(f"{name}.{size}: got {known:g}, need a number > 0")
+        obstacle.check(name, rod, X)
+        stations = slice(0, 1) if obstacle.encloses else slice(None)
+        distances = concrete(_distances(obstacle, positions[stations]))
+        if distances is None:
+            continue
+        gap = distances - radii[stations]
+        j = int(np.argmin(gap))
+        if not gap[j] > -ROUNDING * X[-1]:
+            where, needed = (
+                ("outside", "an arm that starts in the tube")
+                if obstacle.encloses
+                else ("inside", "an arm that is outside at rest")
+            )
+            raise ValueError(
+                f"{name}: the arm at rest is {-gap[j]:.3g} m {where} the {obstacle.effect} at "
+                f"X = {X[j]:g} m, its outline of {radii[j]:g} m included; need {needed}"
+            )
+
+
+@eqx.filter_jit
+def _at_rest(rod: Rod, edges: Array) -> tuple[Array, Array, Array]:
+    """Abscissas [m] along the arm, its positions there at rest, and the radii of its outline."""
+    grid = make_grid(edges, _STEPS, 3)
+    strain = jax.vmap(jax.vmap(rod.rest))(grid.X)
+    poses = step_poses(tuple(strain), grid.h, rod.base)
+    X = jnp.append(grid.start, rod.length)
+    return X, poses[:, :3, 3], jax.vmap(rod.outline)(X)
+
+
+@eqx.filter_jit
+def _distances(obstacle: Obstacle, positions: Array) -> Array:
+    return jax.vmap(obstacle.distance)(positions)

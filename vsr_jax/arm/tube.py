@@ -1,0 +1,184 @@
+"""A lumen inside which the arm runs: a vessel, a bore or a bent tube."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from ..numerics.component import norm, split
+from ..typing import MatrixLike, Pose, Scalar
+from ..validation import concrete, numbers, rigid
+from .functions import Position
+from .obstacles import Obstacle, local_point
+from .profile import Constant, Profile, ProfileLike, as_profile
+from .rod import Rod
+from .spline import hermite_value, spline_slopes
+
+_SAMPLES = 8
+"""Samples of the centre line per point, from the best of which Newton's method starts."""
+_STEPS = 8
+"""Newton steps to the nearest point; the last one or two change nothing."""
+
+
+class Tube(Obstacle):
+    r"""A lumen inside which the arm runs, $d = \max_s (R(s) - |r - c(s)|)$: the union of the balls
+    of radius R(s) about the points of a centre line c(s), positive inside.
+
+    It is the exact distance from the wall for points outside the wall, and for points inside that
+    are nearer to the wall than the wall's radius of curvature. With a constant radius the section
+    across the line is a circle of that radius. The lumen is open: beyond the ends it continues
+    straight. The arm must be inside it at X = 0 and may be outside elsewhere at rest.
+
+    **Arguments:**
+    - `radius`: $R$ [m], a number, or with a line a profile of the abscissa s along it.
+    - `line`: points of the centre line [m], shape (points, 3), in the axes of the pose. Two points
+      are a straight line, more a cubic not-a-knot spline over the abscissa, which is the sum of the
+      distances between the points. By default the x axis, endless.
+    - `pose`: of shape (4, 4), as from `vsr_jax.pose`; the identity by default.
+
+    **Raises:** `ValueError` for fewer than two points, for consecutive points that coincide, and
+    for a profile without a line.
+    """
+
+    radius: Profile = eqx.field(metadata={"unit": "m"})
+    line: Float[Array, "points 3"] | None = eqx.field(metadata={"unit": "m"})
+    pose: Pose | None = eqx.field(metadata={"unit": "-"})
+    effect = "tube"
+    encloses = True
+
+    def __init__(
+        self,
+        radius: ProfileLike,
+        line: MatrixLike | None = None,
+        *,
+        pose: MatrixLike | None = None,
+    ):
+        self.radius = as_profile("Tube.radius", radius, positive=True)
+        self.line = None if line is None else _points("Tube.line", line)
+        self.pose = None if pose is None else rigid("Tube.pose", pose)
+        if self.line is None and not isinstance(self.radius, Constant):
+            raise ValueError(
+                f"Tube.radius: got {radius!r} and no line, need a number for a tube without a line"
+            )
+
+    def distance(self, point: Position) -> Scalar:
+        local = local_point(self.pose, point)
+        if self.line is None:
+            zero = jnp.zeros_like(local[0])
+            return self.radius(zero, zero) - norm((local[1], local[2]))
+        curve = curve_through(self.line, self.radius)
+        s = _nearest(lax.stop_gradient(curve), lax.stop_gradient(local))
+        # one step whose derivative is that of the nearest point: the distance, stationary in s,
+        # then has exact derivatives up to the third
+        rate, slope = _stationarity(curve, local, s)
+        return curve.depth(local, s - rate / lax.stop_gradient(slope))
+
+    def check(self, name: str, rod: Rod, X: Float[Array, " stations"]) -> None:
+        widest = concrete(jnp.max(jax.vmap(rod.outline)(X)))
+        narrowest = concrete(jnp.min(self.radii))
+        if widest is not None and narrowest is not None and not narrowest > widest:
+            raise ValueError(
+                f"{name}.radius: got {narrowest:g} m at the narrowest place, need more than the "
+                f"{widest:g} m of the outline of the arm at the widest"
+            )
+
+    @property
+    def radii(self) -> Float[Array, " samples"]:
+        """Radius [m] at samples along the line."""
+        if self.line is None:
+            zero = jnp.zeros(())
+            return self.radius(zero, zero)[None]
+        curve = curve_through(self.line, self.radius)
+        return jax.vmap(curve.width)(curve.samples)
+
+    @property
+    def sizes(self) -> dict[str, Array]:
+        return {"radius": jnp.min(self.radii)}
+
+
+class Curve(NamedTuple):
+    """A centre line: the abscissas [m] of its points, the points, the derivatives of the spline
+    there, and the radius along it."""
+
+    knots: Float[Array, " points"]
+    points: Float[Array, "points 3"]
+    slopes: Float[Array, "points 3"]
+    radius: Profile
+
+    @property
+    def samples(self) -> Float[Array, " samples"]:
+        """Abscissas [m] of samples, evenly between the points."""
+        share = jnp.linspace(0.0, 1.0, _SAMPLES, endpoint=False, dtype=self.knots.dtype)
+        inner = self.knots[:-1, None] + share * jnp.diff(self.knots)[:, None]
+        return jnp.append(inner.reshape(-1), self.knots[-1])
+
+    def position(self, s: Scalar) -> Position:
+        """Point at an abscissa [m]; on the tangent at the nearest end beyond the ends."""
+        inner = jnp.clip(s, self.knots[0], self.knots[-1])
+        tangent = jnp.where(s < inner, self.slopes[0], self.slopes[-1])
+        return hermite_value(inner, self.knots, self.points, self.slopes) + (s - inner) * tangent
+
+    def width(self, s: Scalar) -> Scalar:
+        """Radius [m] at an abscissa [m]; that of the nearest end beyond the ends."""
+        return self.radius(jnp.clip(s, self.knots[0], self.knots[-1]), self.knots[-1])
+
+    def depth(self, point: Position, s: Scalar) -> Scalar:
+        """Depth [m] of a point in the ball at an abscissa [m]."""
+        return self.width(s) - norm(split(point - self.position(s)))
+
+
+def curve_through(points: Float[Array, "points 3"], radius: Profile) -> Curve:
+    """The centre line through points: two give a straight line."""
+    lengths = jnp.linalg.norm(jnp.diff(points, axis=0), axis=1)
+    knots = jnp.concatenate([jnp.zeros(1, points.dtype), jnp.cumsum(lengths)])
+    slopes = jax.vmap(spline_slopes, (None, 1), 1)(knots, points)
+    return Curve(knots, points, slopes, radius)
+
+
+def _stationarity(curve: Curve, point: Position, s: Scalar) -> tuple[Scalar, Scalar]:
+    """Derivative of the depth in s, times the distance to the line, and its derivative in s."""
+
+    def scaled_rate(s: Scalar) -> Scalar:
+        centre, tangent = jax.jvp(curve.position, (s,), (jnp.ones_like(s),))
+        _, widening = jax.jvp(curve.width, (s,), (jnp.ones_like(s),))
+        apart = point - centre
+        return jnp.sum(apart * tangent) + widening * norm(split(apart))
+
+    return jax.jvp(scaled_rate, (s,), (jnp.ones_like(s),))
+
+
+def _nearest(curve: Curve, point: Position) -> Scalar:
+    """Abscissa of the deepest ball [m]: the best of the samples, improved by Newton steps that stay
+    between its neighbours."""
+    samples = curve.samples
+    best = jnp.argmax(jax.vmap(curve.depth, (None, 0))(point, samples))
+    beyond = 2 * (curve.knots[-1] + jnp.max(jnp.abs(point - curve.points)))
+    ends = jnp.concatenate([-beyond[None], samples, (curve.knots[-1] + beyond)[None]])
+
+    def improve(_: int, bracket: tuple[Scalar, Scalar, Scalar]) -> tuple[Scalar, Scalar, Scalar]:
+        low, s, high = bracket
+        rate, slope = _stationarity(curve, point, s)
+        low, high = jnp.where(rate > 0, s, low), jnp.where(rate > 0, high, s)
+        newton = s - rate / jnp.where(slope < 0, slope, -1.0)
+        sound = (slope < 0) & (newton >= low) & (newton <= high)
+        return low, jnp.where(sound, newton, 0.5 * (low + high)), high
+
+    start = ends[best], samples[best], ends[best + 2]
+    return lax.fori_loop(0, _STEPS, improve, start)[1]
+
+
+def _points(name: str, line: MatrixLike) -> Float[Array, "points 3"]:
+    points = numbers(name, line, None)
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2:
+        raise ValueError(f"{name}: got shape {points.shape}, need (points, 3), two points or more")
+    known = concrete(points)
+    if known is not None and not np.all(np.any(np.diff(known, axis=0) != 0, axis=1)):
+        i = int(np.argmin(np.any(np.diff(known, axis=0) != 0, axis=1)))
+        raise ValueError(
+            f"{name}: got the point {known[i].tolist()} twice in a row, need points apart"
+        )
+    return points

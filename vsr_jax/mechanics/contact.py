@@ -1,0 +1,180 @@
+r"""Contact without friction between an arm and obstacles.
+
+The unknowns are the contact forces $\lambda$ [N], one per obstacle and step of the grid, where the
+gap g to the obstacle is least (see `touch`). The rows are the complementarity of force and gap,
+
+$$\min(\lambda, k g) = 0,$$
+
+so that forces only push, gaps are not negative and one of the two is zero; the stiffness k only
+scales gaps to forces. With the contacts that push given, Newton's method solves for their forces and
+the shape together; which contacts push is found with them (a semismooth Newton method, or active
+set).
+
+On the way to a solution that this does not find at once, penalties stand for the forces, $\lambda =
+k_p \max(0, -g)$: the balance is then the gradient of an energy, which shows whether a step is an
+advance.
+"""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from ..arm.obstacles import Obstacle
+from ..arm.rod import Rod
+from ..arm.scene import CrossSections, Scene
+from ..numerics.component import Forces
+from ..numerics.quadrature import Grid
+from ..numerics.se3 import base_pose
+from .coupling import ArmProblem, ArmState, Border, Coupling
+from .held import of_forces
+from .reaction import Loading
+from .sizes import softest
+from .touch import Surroundings, Touch
+
+_PENALTY = 1e3
+"""Stiffness of the penalties that stand for contact forces, in multiples of k."""
+
+_TOGETHER = 16
+"""Contacts whose forces are solved for together in one step of Newton's method, at most."""
+
+_FLATNESS = 2.5e-5
+"""Of the outline: how far the nearest point of a step may be from the least gap."""
+
+
+class Contacts(Coupling):
+    """All contacts of an arm; the unknowns are their forces [N], shape (obstacles * steps, ...).
+
+    **Fields:** the `obstacles`, the `rod` and the position of its `base`; the stiffness k, `scale`;
+    `flatness` and `lift` of `Surroundings`; `soft`: 1 where penalties stand for the forces.
+    """
+
+    obstacles: tuple[Obstacle, ...]
+    rod: Rod
+    base: Array
+    scale: Array
+    flatness: Array
+    lift: Array
+    soft: Array | None = None
+    steps: int = eqx.field(static=True, default=0)
+    softens = True
+
+    def relaxed(self) -> "Contacts":
+        return replace(self, lift=self.lift + 1e3 * self.rod.length)
+
+    def softened(self, soft: Array) -> "Contacts":
+        return replace(self, soft=soft)
+
+    def guess(self, forces: Forces, grid: Grid) -> Float[Array, "contacts ..."]:
+        size = len(self.obstacles) * self.steps
+        return jnp.zeros((size, *grid.h.shape[1:]), grid.h.dtype)
+
+    def loads(self, x: Array, loads: Loading | None) -> Loading | None:
+        assert loads is not None
+        around = Surroundings(
+            self.obstacles,
+            self.rod,
+            self.base,
+            self.flatness,
+            self.lift,
+            _PENALTY * self.scale,
+            x,
+            self.soft,
+        )
+        return loads._replace(around=around)
+
+    def note(self, x: Array, at: ArmState, problem: ArmProblem) -> Touch:
+        """The contacts, with one axis for obstacles and steps."""
+        assert at.along is not None and at.along.touch is not None
+        touch, ends = at.along.touch, x.ndim + 1
+
+        def flat(a: Array) -> Array:
+            front = a.shape[: a.ndim - ends]
+            return a.reshape(*front, -1, *a.shape[a.ndim - ends + 2 :])
+
+        return Touch(*(flat(a) for a in touch))
+
+    def residual(
+        self, x: Array, at: ArmState, note: Touch, problem: ArmProblem, free: tuple[int, ...]
+    ) -> Array:
+        pushed = self.scale * note.gap
+        exact = jnp.where(note.force < pushed, note.force, pushed)
+        exact = jnp.where(note.own, exact, x - lax.stop_gradient(x))
+        if self.soft is None:
+            return exact
+        return jnp.where(self.soft > 0, x - note.force, exact)
+
+    def border(self, x: Array, at: ArmState, note: Touch, problem: ArmProblem) -> Border:
+        assert at.along is not None
+        pushing = note.own & (note.force >= self.scale * note.gap)
+        hard = jnp.ones_like(x) if self.soft is None else jnp.broadcast_to(1 - self.soft, x.shape)
+        rank = jnp.where(note.own, note.force / self.scale - note.gap, -jnp.inf)
+        size = min(_TOGETHER, x.shape[0])
+        chosen = jnp.argsort(-rank, axis=0)[:size]
+
+        def of(a: Array) -> Array:
+            """Entries (..., contacts, *arms) of the chosen contacts."""
+            front = a.ndim - x.ndim
+            index = jnp.broadcast_to(chosen, (*a.shape[:front], *chosen.shape))
+            return jnp.take_along_axis(a, index, axis=front)
+
+        acts = of(pushing.astype(x.dtype) * hard)
+        step = chosen % self.steps
+        steps = jnp.arange(self.steps).reshape(1, 1, -1, *(1,) * (x.ndim - 1))
+        here = step[:, None, None]
+        shares = jnp.where(
+            steps == here, jnp.moveaxis(of(note.shares), 0, 1)[:, :, None], steps < here
+        ).astype(x.dtype)
+        normal = jnp.moveaxis(of(note.normal), 0, 1)[:, :, None, None]
+        force = shares[:, None] * normal
+        wrenches = of_forces(
+            jnp.concatenate([jnp.zeros_like(force), force], axis=1), at.along, problem.grid
+        )
+        exerted = -of(hard)[:, None, None]
+        return Border(
+            tuple(exerted * part for part in wrenches),
+            wrenches,
+            acts * self.scale,
+            jnp.where(acts > 0, _COMPLIANCE, 1.0),
+            chosen,
+        )
+
+    def sizes(self, x: Array, at: ArmState, problem: ArmProblem) -> list[Array]:
+        return [x / (self.scale * problem.length)]
+
+    def row_sizes(self, rows: Array, at: ArmState, problem: ArmProblem) -> list[Array]:
+        """Gaps and deflections by forces, per length of the arm."""
+        return [rows / (self.scale * problem.length)]
+
+    def units(self, problem: ArmProblem) -> tuple[Array, Array]:
+        root = jnp.sqrt(self.scale)
+        return 1 / root, root
+
+    def radians(self, problem: ArmProblem) -> Array:
+        return 1 / (self.scale * problem.length)
+
+
+_COMPLIANCE = 1e-6
+"""Of a contact in the approximate tangent, in units of 1 / k: two contacts side by side then share
+their force."""
+
+
+def contacts_of(scene: Scene, sections: CrossSections, grid: Grid) -> Contacts | None:
+    """The contacts of a scene; None if it has no obstacles."""
+    if not scene.obstacles:
+        return None
+    base = jnp.asarray(base_pose(scene.rod.base, grid.h.dtype))[:3, 3]
+    length = jnp.sum(grid.h)
+    bending = jnp.sum(grid.weight * softest(sections.stiffness)) / length
+    flatness = _FLATNESS * scene.rod.outline(0.5 * scene.rod.length)
+    return Contacts(
+        scene.obstacles,
+        scene.rod,
+        base,
+        3 * bending / length**3,
+        flatness,
+        jnp.zeros_like(length),
+        steps=grid.h.shape[0],
+    )

@@ -1,0 +1,230 @@
+r"""Where an arm touches obstacles: gaps, contact forces and their derivatives by motions.
+
+The outline of the arm is the surface swept by spheres of radius $\rho(X)$ on its axis. On each step
+of the grid and for each obstacle the nearest point of the axis is found,
+
+$$\sigma = \arg\min_s \, d(r(s)) - \rho(s) + \epsilon (2 s - 1)^2, \quad 0 \le s \le 1,$$
+
+with the distance d to the obstacle and the polynomial r(s) through the step. The small $\epsilon$
+makes it unique where the arm lies along a surface. The gap there is $g = d(r) - \rho$, and without
+friction the contact force is $\lambda n$ with $n = \nabla d$.
+
+The position r(s) is an integral of the axis with weights $a_j(s)$ for the nodes of the step. A force
+at s acts on node j with the share $a_j(s) / a_j(1)$, so that its work is that of the discrete
+positions: the balance with contact forces is the gradient of a discrete energy.
+
+A nearest point at the end of its step is a point of contact only if it is a minimum of the gap along
+the arm too. Else the contact has moved to the next step, and its force with it.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from ..arm.obstacles import Obstacle
+from ..arm.rod import Rod
+from ..numerics.batching import arms_in
+from ..numerics.quadrature import Grid, gauss_legendre, interpolation
+
+_SAMPLES, _ITERATIONS = 5, 6
+"""Points of a step from which the nearest one starts, and Newton steps from it."""
+
+
+class Surroundings(NamedTuple):
+    """The obstacles around an arm.
+
+    **Fields:** the `obstacles`, the `rod` and the position of its `base`; `flatness` $\\epsilon$
+    [m]; `lift` [m], added to all gaps; `force` [N] of each obstacle on each step, shape (obstacles *
+    steps, ...); `soft`: None, or 1 where penalties of `stiffness` [N/m] stand for the forces.
+    """
+
+    obstacles: tuple[Obstacle, ...]
+    rod: Rod
+    base: Array
+    flatness: Array
+    lift: Array
+    stiffness: Array
+    force: Array
+    soft: Array | None
+
+
+class Touch(NamedTuple):
+    r"""Contact of each obstacle with each step, arrays (..., obstacles, steps, *arms).
+
+    **Fields:** `gap` [m]; `normal` (3) and `place` (3) of the contact in the world; `sigma`, its
+    place in the step; `shares` (stages) of a force there for the nodes of the step; `own`: whether
+    it is a minimum of the gap along the arm; `force` [N]; `slope` (6, 6): derivative of the wrench
+    by the motion of the section, without that of the force by the gap; `touching`: where that acts.
+    """
+
+    gap: Array
+    normal: Array
+    place: Array
+    sigma: Array
+    shares: Array
+    own: Array
+    force: Array
+    slope: Array
+
+
+class _Nearest(NamedTuple):
+    """The nearest point of one step: place in the step, gap, normal, position, derivatives of the
+    gap at both ends and the matrix of `Touch.slope` per force."""
+
+    sigma: Array
+    gap: Array
+    normal: Array
+    place: Array
+    ends: Array
+    slope: Array
+
+
+def touch_of(axis: Array, grid: Grid, around: Surroundings) -> Touch:
+    """Contact for the axis p' at the nodes, shape (3, stages, steps, *arms)."""
+    parts = jnp.sum(grid.weight * axis, axis=1)
+    base = around.base.reshape(
+        3, 1, *around.base.shape[1:], *(1,) * (parts.ndim - 1 - around.base.ndim)
+    )
+    starts = base + jnp.cumsum(parts, axis=1) - parts
+    found = [
+        _each(_nearest, obstacle, around.rod, around.flatness, starts, axis, grid.start, grid.h)
+        for obstacle in around.obstacles
+    ]
+    near = jax.tree.map(lambda *x: jnp.stack(x, axis=x[0].ndim - starts.ndim + 1), *found)
+    gap = near.gap + around.lift
+    ahead, back = _leaving(near, around.flatness)
+    own = ~ahead & ~back
+    force = _carried(around.force.reshape(gap.shape), ahead, back)
+    slope = near.slope
+    if around.soft is not None:
+        pressed = jnp.where(gap < 0, around.stiffness, 0.0)
+        force = around.soft * pressed * -gap + (1 - around.soft) * force
+        n = near.normal
+        push = -around.soft * pressed * n[:, None] * n[None]
+        slope = (force * slope).at[3:, 3:].add(push)
+    else:
+        slope = force * slope
+    cumulative, weights = _weights(near.sigma, grid.X.shape[0])
+    shares = cumulative / weights.reshape(-1, *(1,) * near.sigma.ndim)
+    return Touch(gap, near.normal, near.place, near.sigma, shares, own, force, slope)
+
+
+def contact_forces(touch: Touch) -> Array:
+    """Force by all contacts beyond each node in the world, (3, stages, steps, *arms)."""
+    forces = touch.force * touch.normal
+    of_step = jnp.sum(forces, axis=1)
+    later = lax.cumsum(of_step, axis=1, reverse=True) - of_step
+    return later[:, None] + jnp.sum(touch.shares[None] * forces[:, None], axis=2)
+
+
+def at_ends(touch: Touch) -> Array:
+    """Slopes of all contacts at the ends of the steps, (6, 6, steps, *arms), each shared by both
+    ends of its step."""
+    s = touch.sigma
+    later, before = (jnp.sum(share * touch.slope, axis=2) for share in (s, 1 - s))
+    return later + jnp.concatenate([before[:, :, 1:], jnp.zeros_like(before[:, :, :1])], axis=2)
+
+
+def _weights(sigma: Array, stages: int) -> tuple[Array, Array]:
+    """Weights (stages, ...) of the integral from the start of a step of length 1 to sigma, and of
+    that over the whole step."""
+    b = jnp.asarray(interpolation(stages), sigma.dtype)
+    powers = [sigma ** (p + 1) / (p + 1) for p in range(stages)]
+    cumulative = jnp.stack([sum(b[p, j] * powers[p] for p in range(stages)) for j in range(stages)])
+    return cumulative, jnp.asarray(gauss_legendre(stages)[1], sigma.dtype)
+
+
+def _nearest(
+    obstacle: Obstacle, rod: Rod, flatness: Array, start: Array, axis: Array, X: Array, h: Array
+) -> _Nearest:
+    """The nearest point of one step of one arm."""
+
+    def place(s: Array) -> Array:
+        return start + h * (axis @ _weights(s, axis.shape[1])[0])
+
+    def gap(s: Array) -> Array:
+        return obstacle.distance(place(s)) - rod.outline(X + s * h)
+
+    def lifted(s: Array) -> Array:
+        return gap(s) + flatness * (2 * s - 1) ** 2
+
+    slope_at, curvature_at = jax.grad(lifted), jax.grad(jax.grad(lifted))
+    samples = jnp.linspace(0.0, 1.0, _SAMPLES, dtype=h.dtype)
+    first = samples[jnp.argmin(jax.vmap(lifted)(samples))]
+
+    def closer(_: int, s: Array) -> Array:
+        slope, curvature = slope_at(s), curvature_at(s)
+        step = jnp.where(curvature > 0, slope / curvature, jnp.sign(slope))
+        return jnp.clip(s - jnp.clip(step, -0.25, 0.25), 0.0, 1.0)
+
+    s = lax.stop_gradient(lax.fori_loop(0, _ITERATIONS, closer, first))
+    curvature = lax.stop_gradient(curvature_at(s))
+    inside = (s > 0) & (s < 1) & (curvature > 0)
+    curvature = jnp.where(inside, curvature, 1.0)
+    # its derivative by the shape is that of the root of the slope
+    s = jnp.clip(s - jnp.where(inside, slope_at(s) / curvature, 0.0), 0.0, 1.0)
+    r, along = jax.jvp(place, (s,), (jnp.ones_like(s),))
+    normal, turn = jax.jvp(jax.grad(obstacle.distance), (r,), (along,))
+    bend = jax.jacfwd(jax.grad(obstacle.distance))(r)
+    moved = jnp.concatenate([jnp.cross(along, normal), turn])
+    slope = -jnp.where(inside, 1 / curvature, 0.0) * moved[:, None] * moved[None]
+    ends = jnp.stack([jax.grad(gap)(jnp.zeros_like(s)), jax.grad(gap)(jnp.ones_like(s))])
+    return _Nearest(s, gap(s), normal, r, ends, slope.at[3:, 3:].add(bend))
+
+
+def _leaving(near: _Nearest, flatness: Array) -> tuple[Array, Array]:
+    """Whether the contact of a step has moved to the next one, and to the one before it, from the
+    derivative of the gap at the ends that it shares with them."""
+    first, last = near.ends[0], near.ends[1]
+    between = 0.5 * (last[:, :-1] + first[:, 1:])
+    small = 4 * flatness
+    no = jnp.zeros_like(first[:, :1], bool)
+    ahead = jnp.concatenate([between < -small, no], axis=1)
+    back = jnp.concatenate([no, between > small], axis=1)
+    # at the base nothing moves
+    fixed = (near.sigma[:, :1] <= 0) & (first[:, :1] > 0)
+    back = jnp.concatenate([fixed | back[:, :1], back[:, 1:]], axis=1)
+    return ahead, back & ~ahead
+
+
+def _carried(force: Array, ahead: Array, back: Array) -> Array:
+    """The forces, those of contacts that have moved to another step carried there."""
+
+    def passed(force: Array, leaving: Array, reverse: bool) -> Array:
+        def one(carry: Array, step: tuple) -> tuple[Array, Array]:
+            here, gone = step
+            total = carry + here
+            return jnp.where(gone, total, 0.0), jnp.where(gone, 0.0, total)
+
+        moved = jnp.moveaxis(force, 1, 0), jnp.moveaxis(leaving, 1, 0)
+        _, kept = lax.scan(one, jnp.zeros_like(moved[0][0]), moved, reverse=reverse)
+        return jnp.moveaxis(kept, 0, 1)
+
+    return passed(passed(force, ahead, False), back, True)
+
+
+def _each(
+    function: Callable,
+    obstacle: Obstacle,
+    rod: Rod,
+    flatness: Array,
+    starts: Array,
+    axis: Array,
+    X: Array,
+    h: Array,
+) -> Any:
+    """A function of every step of every arm, its axes in front of those of steps and arms."""
+    behind = h.ndim - 1
+    of_arm = jax.vmap(function, (None, None, None, 1, 2, 0, 0), -1)
+    arguments = obstacle, rod, flatness, starts, axis, X, h
+    if behind:
+        arms = arms_in(arguments, behind)
+        arguments = jax.tree.map(
+            lambda x: jnp.broadcast_to(x, (*x.shape[: x.ndim - behind], *arms)), arguments
+        )
+        of_arm = jax.vmap(of_arm, -1, -1)
+    return of_arm(*arguments)
