@@ -12,7 +12,14 @@ from jaxtyping import Array
 from ..numerics import component as c
 from ..numerics.batching import arms_in, side_by_side
 from ..numerics.component import Vector
-from ..numerics.damped_newton import LOAD_INCREMENTS, MAX_TURN, Damped, Measures, damped_newton
+from ..numerics.damped_newton import (
+    HARDENING_STAGES,
+    LOAD_INCREMENTS,
+    MAX_TURN,
+    Damped,
+    Measures,
+    damped_newton,
+)
 from ..numerics.implicit import implicit_root
 from ..numerics.newton import Root
 from ..typing import cast
@@ -211,5 +218,5 @@ def _solve(
     shares = 1 if whole.loads is None else LOAD_INCREMENTS
     floor = jnp.broadcast_to(rounding_of(whole), arms)
     again = None if guess is None else origin
-    measures = Measures(sizes.work, sizes.turn, sizes.dot if whole.follows_rate else None)
-    return damped_newton(evaluate, measures, start, floor, shares, again, exact=whole.softens)
+    measures = Measures(sizes.work, sizes.turn, sizes.dot if whole.follows_rate or whole.softens else None)
+    return damped_newton(evaluate, measures, start, floor, shares, again, stages=HARDENING_STAGES if whole.softens else 0)

@@ -19,7 +19,6 @@ from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float
 
 from ..arm.obstacles import Obstacle
@@ -28,20 +27,25 @@ from ..arm.scene import CrossSections, Scene
 from ..numerics.component import Forces
 from ..numerics.quadrature import Grid
 from ..numerics.se3 import base_pose
-from .coupling import ArmProblem, ArmState, Border, Coupling
+from .coupling import SOFTENED, ArmProblem, ArmState, Border, Coupling
 from .held import of_forces
 from .reaction import Loading
 from .sizes import softest
 from .touch import Surroundings, Touch
 
-_PENALTY = 1e3
-"""Stiffness of the penalties that stand for contact forces, in multiples of k."""
+_PENALTY, _WIDTH, _SHARPER = 100.0, 0.02, 1e-3
+"""Stiffness of the penalties that stand for contact forces, in multiples of k; the gap at which they
+begin to act, as a fraction of the arm's length, and by what it becomes smaller as they harden."""
 
-_TOGETHER = 16
+_BLUR = 1e-9
+"""Product of gap and scaled force at the end, as its root and a fraction of the arm's length."""
+
+_TOGETHER = 24
 """Contacts whose forces are solved for together in one step of Newton's method, at most."""
 
-_FLATNESS = 2.5e-5
-"""Of the outline: how far the nearest point of a step may be from the least gap."""
+_FLATNESS, _FLATTER = 1e-3, 0.5
+"""How far the nearest point of a step may be from the least gap, as a fraction of the outline, and
+of the width of penalties."""
 
 
 class Contacts(Coupling):
@@ -57,15 +61,21 @@ class Contacts(Coupling):
     scale: Array
     flatness: Array
     lift: Array
+    blur: Array
     soft: Array | None = None
+    width: Array | None = None
     steps: int = eqx.field(static=True, default=0)
     softens = True
 
     def relaxed(self) -> "Contacts":
         return replace(self, lift=self.lift + 1e3 * self.rod.length)
 
-    def softened(self, soft: Array) -> "Contacts":
-        return replace(self, soft=soft)
+    def softened(self, hardness: Array) -> "Contacts":
+        soft = (hardness < SOFTENED).astype(self.scale.dtype)
+        width = (_WIDTH * _SHARPER**hardness * self.rod.length).astype(self.scale.dtype)
+        flatness = jnp.where(soft > 0, jnp.maximum(self.flatness, _FLATTER * width), self.flatness)
+        blur = (_BLUR ** jnp.clip(hardness, 0.25, 1.0) * self.rod.length).astype(self.scale.dtype)
+        return replace(self, soft=soft, width=width, flatness=flatness, blur=blur)
 
     def guess(self, forces: Forces, grid: Grid) -> Float[Array, "contacts ..."]:
         size = len(self.obstacles) * self.steps
@@ -82,6 +92,7 @@ class Contacts(Coupling):
             _PENALTY * self.scale,
             x,
             self.soft,
+            self.width,
         )
         return loads._replace(around=around)
 
@@ -100,17 +111,17 @@ class Contacts(Coupling):
         self, x: Array, at: ArmState, note: Touch, problem: ArmProblem, free: tuple[int, ...]
     ) -> Array:
         pushed = self.scale * note.gap
-        exact = jnp.where(note.force < pushed, note.force, pushed)
-        exact = jnp.where(note.own, exact, x - lax.stop_gradient(x))
+        exact = 0.5 * (note.force + pushed - self._root(note.force - pushed))
         if self.soft is None:
             return exact
         return jnp.where(self.soft > 0, x - note.force, exact)
 
     def border(self, x: Array, at: ArmState, note: Touch, problem: ArmProblem) -> Border:
         assert at.along is not None
-        pushing = note.own & (note.force >= self.scale * note.gap)
+        apart = note.force - self.scale * note.gap
+        pushing = 0.5 * (1 + apart / self._root(apart))
         hard = jnp.ones_like(x) if self.soft is None else jnp.broadcast_to(1 - self.soft, x.shape)
-        rank = jnp.where(note.own, note.force / self.scale - note.gap, -jnp.inf)
+        rank = note.force / self.scale - note.gap
         size = min(_TOGETHER, x.shape[0])
         chosen = jnp.argsort(-rank, axis=0)[:size]
 
@@ -120,7 +131,7 @@ class Contacts(Coupling):
             index = jnp.broadcast_to(chosen, (*a.shape[:front], *chosen.shape))
             return jnp.take_along_axis(a, index, axis=front)
 
-        acts = of(pushing.astype(x.dtype) * hard)
+        acts, released = of(pushing * hard), of(1 - pushing * hard)
         step = chosen % self.steps
         steps = jnp.arange(self.steps).reshape(1, 1, -1, *(1,) * (x.ndim - 1))
         here = step[:, None, None]
@@ -137,9 +148,13 @@ class Contacts(Coupling):
             tuple(exerted * part for part in wrenches),
             wrenches,
             acts * self.scale,
-            jnp.where(acts > 0, _COMPLIANCE, 1.0),
+            jnp.maximum(released, _COMPLIANCE),
             chosen,
         )
+
+    def _root(self, apart: Array) -> Array:
+        """A smooth absolute value of the difference of force and scaled gap."""
+        return jnp.sqrt(apart**2 + (2 * self.scale * self.blur) ** 2)
 
     def sizes(self, x: Array, at: ArmState, problem: ArmProblem) -> list[Array]:
         return [x / (self.scale * problem.length)]
@@ -176,5 +191,6 @@ def contacts_of(scene: Scene, sections: CrossSections, grid: Grid) -> Contacts |
         3 * bending / length**3,
         flatness,
         jnp.zeros_like(length),
+        _BLUR * length,
         steps=grid.h.shape[0],
     )

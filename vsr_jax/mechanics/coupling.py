@@ -27,9 +27,16 @@ from jaxtyping import Array, PyTree
 from ..arm.scene import CrossSections, Scene
 from ..numerics import component as c, lu
 from ..numerics.component import Forces, Vector
+from ..numerics.damped_newton import HARDENING_STAGES, LOAD_INCREMENTS, SOFT_STAGES
 from ..numerics.quadrature import Grid
 from .balance import without_force
 from .reaction import Loading, Reaction
+
+HARDENING = HARDENING_STAGES / LOAD_INCREMENTS
+"""Fraction of the loads, in increments of a solve, by which constraints harden."""
+
+SOFTENED = (SOFT_STAGES - 0.5) / HARDENING_STAGES
+"""Hardness from which constraints have no energy."""
 
 Shares = tuple[Array | None, ...]
 """Share of each thread's force at the nodes; None for 1."""
@@ -55,13 +62,14 @@ class ArmProblem(NamedTuple):
 
     def with_share(self, share: Array) -> "ArmProblem":
         """The problem with a fraction of its loads. Constraints that soften are springs up to the
-        fraction 1, with all loads, and exact above it."""
+        fraction 1, with all loads; above it they harden to the fraction 1 + `HARDENING`, where they
+        are exact."""
         if self.loads is None:
             return self
         if not self.softens:
             return self._replace(loads=self.loads.scaled(share))
-        soft = (share <= 1).astype(share.dtype)
-        couplings = tuple(coupling.softened(soft) for coupling in self.couplings)
+        hardness = jnp.maximum(share - 1.0, 0.0) / HARDENING
+        couplings = tuple(coupling.softened(hardness) for coupling in self.couplings)
         return self._replace(loads=self.loads.scaled(jnp.minimum(share, 1.0)), couplings=couplings)
 
     def at_rest(self) -> "ArmProblem":
@@ -152,9 +160,9 @@ class Coupling(eqx.Module):
     def guess(self, forces: Forces, grid: Grid) -> PyTree:
         """Unknowns that go with the forces of all threads at their start, to begin with."""
 
-    def softened(self, soft: Array) -> "Coupling":
-        """The coupling with springs in place of its constraint where `soft` is 1, exact where it is
-        0; the same by default."""
+    def softened(self, hardness: Array) -> "Coupling":
+        """The coupling with springs in place of its constraint, from `hardness` 0 up to 1, where it
+        is exact; the same by default."""
         return self
 
     def loads(self, x: PyTree, loads: Loading | None) -> Loading | None:

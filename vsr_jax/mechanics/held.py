@@ -39,7 +39,7 @@ from ..numerics.stacked import (
     turned,
 )
 from ..typing import Scalar
-from .coupling import ArmProblem, ArmState, Border, Coupling
+from .coupling import SOFTENED, ArmProblem, ArmState, Border, Coupling
 from .pose_terms import PoseTerm
 from .reaction import Loading, Reaction, rotation_at, rotations
 from .sizes import shape_of, softest
@@ -107,8 +107,8 @@ class Holds(Coupling):
     def relaxed(self) -> "Holds":
         return replace(self, share=jnp.zeros_like(self.share))
 
-    def softened(self, soft: Array) -> "Holds":
-        return replace(self, soft=soft)
+    def softened(self, hardness: Array) -> "Holds":
+        return replace(self, soft=(hardness < SOFTENED).astype(self.scale.dtype))
 
     def guess(self, forces: Forces, grid: Grid) -> Float[Array, "components ..."]:
         return jnp.zeros((len(self.scale), *grid.h.shape[1:]), grid.h.dtype)

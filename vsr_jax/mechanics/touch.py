@@ -12,9 +12,6 @@ friction the contact force is $\lambda n$ with $n = \nabla d$.
 The position r(s) is an integral of the axis with weights $a_j(s)$ for the nodes of the step. A force
 at s acts on node j with the share $a_j(s) / a_j(1)$, so that its work is that of the discrete
 positions: the balance with contact forces is the gradient of a discrete energy.
-
-A nearest point at the end of its step is a point of contact only if it is a minimum of the gap along
-the arm too. Else the contact has moved to the next step, and its force with it.
 """
 
 from collections.abc import Callable
@@ -50,15 +47,15 @@ class Surroundings(NamedTuple):
     stiffness: Array
     force: Array
     soft: Array | None
+    width: Array | None
 
 
 class Touch(NamedTuple):
     r"""Contact of each obstacle with each step, arrays (..., obstacles, steps, *arms).
 
     **Fields:** `gap` [m]; `normal` (3) and `place` (3) of the contact in the world; `sigma`, its
-    place in the step; `shares` (stages) of a force there for the nodes of the step; `own`: whether
-    it is a minimum of the gap along the arm; `force` [N]; `slope` (6, 6): derivative of the wrench
-    by the motion of the section, without that of the force by the gap; `touching`: where that acts.
+    place in the step; `shares` (stages) of a force there for the nodes of the step; `force` [N];
+    `slope` (6, 6): derivative of the wrench by the motion of the section, at a given force.
     """
 
     gap: Array
@@ -66,20 +63,18 @@ class Touch(NamedTuple):
     place: Array
     sigma: Array
     shares: Array
-    own: Array
     force: Array
     slope: Array
 
 
 class _Nearest(NamedTuple):
-    """The nearest point of one step: place in the step, gap, normal, position, derivatives of the
-    gap at both ends and the matrix of `Touch.slope` per force."""
+    """The nearest point of one step: place in the step, gap, normal, position, and the matrix of
+    `Touch.slope` per force."""
 
     sigma: Array
     gap: Array
     normal: Array
     place: Array
-    ends: Array
     slope: Array
 
 
@@ -96,21 +91,19 @@ def touch_of(axis: Array, grid: Grid, around: Surroundings) -> Touch:
     ]
     near = jax.tree.map(lambda *x: jnp.stack(x, axis=x[0].ndim - starts.ndim + 1), *found)
     gap = near.gap + around.lift
-    ahead, back = _leaving(near, around.flatness)
-    own = ~ahead & ~back
-    force = _carried(around.force.reshape(gap.shape), ahead, back)
-    slope = near.slope
-    if around.soft is not None:
-        pressed = jnp.where(gap < 0, around.stiffness, 0.0)
-        force = around.soft * pressed * -gap + (1 - around.soft) * force
-        n = near.normal
-        push = -around.soft * pressed * n[:, None] * n[None]
-        slope = (force * slope).at[3:, 3:].add(push)
-    else:
+    force, slope = around.force.reshape(gap.shape), near.slope
+    if around.soft is None or around.width is None:
         slope = force * slope
+    else:
+        root = jnp.sqrt(gap**2 + around.width**2)
+        penalty = 0.5 * around.stiffness * (root - gap)
+        rate = 0.5 * around.stiffness * (gap / root - 1)
+        force = jnp.where(around.soft > 0, penalty, force)
+        push = jnp.where(around.soft > 0, rate, 0.0) * near.normal[:, None] * near.normal[None]
+        slope = (force * slope).at[3:, 3:].add(push)
     cumulative, weights = _weights(near.sigma, grid.X.shape[0])
     shares = cumulative / weights.reshape(-1, *(1,) * near.sigma.ndim)
-    return Touch(gap, near.normal, near.place, near.sigma, shares, own, force, slope)
+    return Touch(gap, near.normal, near.place, near.sigma, shares, force, slope)
 
 
 def contact_forces(touch: Touch) -> Array:
@@ -172,39 +165,7 @@ def _nearest(
     bend = jax.jacfwd(jax.grad(obstacle.distance))(r)
     moved = jnp.concatenate([jnp.cross(along, normal), turn])
     slope = -jnp.where(inside, 1 / curvature, 0.0) * moved[:, None] * moved[None]
-    ends = jnp.stack([jax.grad(gap)(jnp.zeros_like(s)), jax.grad(gap)(jnp.ones_like(s))])
-    return _Nearest(s, gap(s), normal, r, ends, slope.at[3:, 3:].add(bend))
-
-
-def _leaving(near: _Nearest, flatness: Array) -> tuple[Array, Array]:
-    """Whether the contact of a step has moved to the next one, and to the one before it, from the
-    derivative of the gap at the ends that it shares with them."""
-    first, last = near.ends[0], near.ends[1]
-    between = 0.5 * (last[:, :-1] + first[:, 1:])
-    small = 4 * flatness
-    no = jnp.zeros_like(first[:, :1], bool)
-    ahead = jnp.concatenate([between < -small, no], axis=1)
-    back = jnp.concatenate([no, between > small], axis=1)
-    # at the base nothing moves
-    fixed = (near.sigma[:, :1] <= 0) & (first[:, :1] > 0)
-    back = jnp.concatenate([fixed | back[:, :1], back[:, 1:]], axis=1)
-    return ahead, back & ~ahead
-
-
-def _carried(force: Array, ahead: Array, back: Array) -> Array:
-    """The forces, those of contacts that have moved to another step carried there."""
-
-    def passed(force: Array, leaving: Array, reverse: bool) -> Array:
-        def one(carry: Array, step: tuple) -> tuple[Array, Array]:
-            here, gone = step
-            total = carry + here
-            return jnp.where(gone, total, 0.0), jnp.where(gone, 0.0, total)
-
-        moved = jnp.moveaxis(force, 1, 0), jnp.moveaxis(leaving, 1, 0)
-        _, kept = lax.scan(one, jnp.zeros_like(moved[0][0]), moved, reverse=reverse)
-        return jnp.moveaxis(kept, 0, 1)
-
-    return passed(passed(force, ahead, False), back, True)
+    return _Nearest(s, gap(s), normal, r, slope.at[3:, 3:].add(bend))
 
 
 def _each(

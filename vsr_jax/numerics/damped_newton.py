@@ -20,6 +20,9 @@ MAX_PLAIN_STEPS = 25
 LOAD_INCREMENTS = 5
 """Increments in which `damped_newton` applies the loads where they cannot be applied at once: the
 tangent is often indefinite at the start under all loads."""
+SOFT_STAGES, HARDENING_STAGES = 2, 8
+"""Increments after the loads by which constraints become exact in `damped_newton`, and the first of
+them, which have an energy."""
 MAX_TURN = 1.5
 """Bound on the angle [rad] by which one step of a loaded solve bends and twists the arm. A step
 that coils the arm may lower the residual without approaching a solution."""
@@ -113,7 +116,7 @@ def damped_newton(
     increments: int = 1,
     origin: Any = None,
     *,
-    exact: bool = False,
+    stages: int = 0,
 ) -> Root:
     r"""Root of a residual that is the gradient of an energy, or nearly so, by Newton's method with
     Levenberg damping.
@@ -154,15 +157,15 @@ def damped_newton(
     - `floor`: size of the residual that counts as rounding, one entry per problem.
     - `increments`: number of load increments.
     - `origin`: where the second attempt begins, the start by default.
-    - `exact`: whether the problem has constraints that are springs up to the fraction 1 of the
-      loads. One more increment, once the problem with springs is nearly solved, makes them exact.
+    - `stages`: further increments after the loads, each once the problem before it is nearly
+      solved: of constraints that are springs first and exact in the last one.
 
     **Returns:** a `Root`; it is converged if the residual at the end is rounding or as small as a
     negligible step.
     """
     twice = increments > 1 or origin is not None
     origin = start if origin is None else origin
-    levels = increments + exact
+    levels = increments + stages
     small = float(jnp.finfo(floor.dtype).eps ** 0.75)
     accepted = jnp.maximum(_ACCEPTED * floor, small)
 
@@ -186,13 +189,20 @@ def damped_newton(
         damping, applied = _attempt(old, plain, increments, levels)
         new = evaluate(trial, jnp.where(probe, _PROBE_DAMPING, damping), applied / increments)
         left = measures.work(new.residual, step)
-        taken = _accepted(old, new, left, floor, plain, increments)
+        # the stages that are nearly exact have no energy
+        hard = old.gradual & (applied >= increments + SOFT_STAGES)
+        taken = _accepted(old, new, left, floor, plain | hard, applied, increments)
         guard, more, last = _judged(
-            old, new, left, taken, plain, damping, applied, floor, accepted, small
+            old, new, left, taken, plain | hard, damping, applied, floor, accepted, small
         )
-        more = jnp.where(probe, 1.0, more)
+        guard = guard._replace(plain=old.plain + plain.astype(jnp.int32))
+        more = jnp.where(probe, 1.0, jnp.where(hard, 0.0, more))
         new_step = jax.tree.map(lambda s, last: s + more.astype(s.dtype) * last, new.step, step)
-        if measures.dot is not None:
+        if stages and measures.dot is not None:
+            back = hard & (measures.dot(new_step, step) < -0.5 * measures.dot(step, step))
+            half = jnp.where(back, 0.5, 1.0)
+            new_step = jax.tree.map(lambda s: half.astype(s.dtype) * s, new_step)
+        elif measures.dot is not None:
             tail = ~probe & (measures.turn(step) < _TAIL) & (new.size > small)
             linear = tail & _linear(old, guard)
             near = accelerated(new.step, step, earlier, linear & (old.whole > 0), measures.dot)
@@ -281,14 +291,20 @@ def _attempt(old: _Guard, plain: Array, increments: int, levels: int) -> tuple[A
     damping = jnp.where(old.fresh, _lowered(old.damping), old.damping)
     more = jnp.where(old.fresh, jnp.minimum(old.applied + 1, increments), old.applied)
     if levels > increments:
-        settled = (old.applied >= increments) & (old.damping == 0) & (old.size < _SETTLED)
-        more = jnp.where(old.applied == levels, levels, more)
-        more = jnp.where(old.fresh & settled, levels, more)
+        settled = old.fresh & (old.damping == 0) & (old.size < _SETTLED)
+        further = jnp.minimum(old.applied + settled, levels)
+        more = jnp.where(old.applied >= increments, further, more)
     return jnp.where(plain, 0.0, damping), jnp.where(plain, levels, more)
 
 
 def _accepted(
-    old: _Guard, new: Damped, left: Array, floor: Array, plain: Array, increments: int
+    old: _Guard,
+    new: Damped,
+    left: Array,
+    floor: Array,
+    plain: Array,
+    applied: Array,
+    increments: int,
 ) -> Array:
     """Whether the step to a new point is taken. A point that was evaluated only with more damping
     is kept.
@@ -297,6 +313,7 @@ def _accepted(
     """
     better = (
         (old.applied < increments)
+        | (old.applied < applied)
         | (left >= -old.pull)
         | (new.merit < old.merit)
         | (new.merit < floor)
@@ -351,7 +368,7 @@ def _judged(
     # a rejected step is computed again with more damping before it is used; that of a problem that
     # is done is never used
     return (
-        guard._replace(spent=old.spent + 1, plain=old.plain + plain.astype(jnp.int32)),
+        guard._replace(spent=old.spent + 1),
         more,
         last,
     )
