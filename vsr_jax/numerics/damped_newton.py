@@ -202,7 +202,7 @@ def damped_newton(
             back = hard & (measures.dot(new_step, step) < -0.5 * measures.dot(step, step))
             half = jnp.where(back, 0.5, 1.0)
             new_step = jax.tree.map(lambda s: half.astype(s.dtype) * s, new_step)
-        elif measures.dot is not None:
+        if measures.dot is not None:
             tail = ~probe & (measures.turn(step) < _TAIL) & (new.size > small)
             linear = tail & _linear(old, guard)
             near = accelerated(new.step, step, earlier, linear & (old.whole > 0), measures.dot)
