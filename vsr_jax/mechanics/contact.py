@@ -25,7 +25,7 @@ from ..arm.obstacles import Obstacle
 from ..arm.rod import Rod
 from ..arm.scene import CrossSections, Scene
 from ..numerics.component import Forces
-from ..numerics.quadrature import Grid
+from ..numerics.quadrature import Grid, locate
 from ..numerics.se3 import base_pose
 from .coupling import SOFTENED, ArmProblem, ArmState, Border, Coupling
 from .held import of_forces
@@ -151,6 +151,14 @@ class Contacts(Coupling):
             jnp.maximum(released, _COMPLIANCE),
             chosen,
         )
+
+    def moved(self, x: Array, X: Array, grid: Grid) -> Array:
+        """The forces on the steps in which the middles of the old ones lie."""
+        if X.shape[1] == self.steps:
+            return x
+        step, _ = locate(grid, jnp.mean(X, axis=0))
+        force = x.reshape(len(self.obstacles), -1)
+        return jnp.zeros((len(force), self.steps), x.dtype).at[:, step].add(force).reshape(-1)
 
     def _root(self, apart: Array) -> Array:
         """A smooth absolute value of the difference of force and scaled gap."""

@@ -130,6 +130,11 @@ class Holds(Coupling):
                 terms.append(PoseTerm(self._spring(hold, scale), self.rod, soft, *hold[:3]))
         return loads._replace(dead=dead, by_pose=(*loads.by_pose, *terms))
 
+    def wrenches(self, x: Array) -> Float[Array, "supports 6"]:
+        """Moment and force of each support in the world frame, for the unknowns of one arm."""
+        parts = zip(self.holds, self._parts(x), strict=True)
+        return jnp.stack([hold.wrench(part) for hold, part in parts])
+
     def note(self, x: Array, at: ArmState, problem: ArmProblem) -> Array:
         """Deviations from what is held, positions [m] and rotations [rad]."""
         along = at.along

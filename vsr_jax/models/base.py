@@ -155,6 +155,18 @@ class Model(eqx.Module):
         """The loads on the grid of a solution, and the wrenches of what holds the arm."""
         return loading(scene, grid)
 
+    def balance(self, scene: Scene, forces: Forces, state: Any) -> tuple[ArmProblem, ArmUnknown]:
+        """The coupled balance at a solution of a scene with held sections or obstacles."""
+        raise ValueError(f"model: got {type(self).__name__}, need StrainDependent")
+
+    def refuse_constraints(self, scene: Scene) -> None:
+        """Raises `ValueError` for a scene with held sections or obstacles."""
+        found = "held sections" if scene.held else "obstacles" if scene.obstacles else None
+        if found:
+            raise ValueError(
+                f"model: got {type(self).__name__} for a scene with {found}, need StrainDependent"
+            )
+
     @abstractmethod
     def finer(self) -> "Model":
         """The same model with twice the steps, or with tighter tolerances if the steps are
@@ -233,6 +245,8 @@ class SteppedModel(Model):
         """Strain at the nodes of `grid`, six component arrays of shape (stages, steps)."""
 
     def refined(self, scene: Scene, inputs: Array, forces: Forces, state: Any) -> Refinement:
+        if scene.obstacles:  # contacts are not corrected by one Newton step
+            return super().refined(scene, inputs, forces, state)
         if self.balanced_everywhere and scene.edges().size == 2 and self.steps > 1:
             if not scene.coupled:
                 return self._merged(scene, state)

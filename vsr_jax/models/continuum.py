@@ -118,6 +118,7 @@ class Continuum(Model):
         )
 
     def solve(self, scene: Scene, inputs: Float[Array, " inputs"]) -> Outcome:
+        self.refuse_constraints(scene)
         tip, forces, status, steps = _tip(self, scene, inputs)
         return Outcome(Found(tip, inputs), forces, status, steps)
 

@@ -146,6 +146,7 @@ class Prescribed(SteppedModel):
 
     def solve(self, scene: Scene, inputs: Float[Array, " inputs"]) -> Outcome:
         self.basis.check(scene, type(self).__name__)
+        self.refuse_constraints(scene)
         if scene.coupled:
             return self._solve_together(scene, inputs)
         projection, forces = project(scene, self.basis, self.points), scene.forces(inputs)

@@ -22,7 +22,7 @@ from ..mechanics.reaction import reaction_change, slopes_of
 from ..numerics import component as c, lu
 from ..numerics.batching import arms_in, side_by_side
 from ..numerics.component import Vector
-from ..numerics.damped_newton import HARDENING_STAGES, LOAD_INCREMENTS, MAX_TURN, Damped, Measures, damped_newton
+from ..numerics.damped_newton import LOAD_INCREMENTS, MAX_TURN, Damped, Measures, damped_newton
 from ..numerics.implicit import implicit_root
 from ..numerics.newton import Root
 from ..numerics.quadrature import Grid
@@ -287,8 +287,8 @@ def _solve(basis: NodalBasis, problem: ArmProblem) -> Root:
     first = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(x), *arms)), first)
     floor = jnp.broadcast_to(rounding_of(problem), arms)
     shares = 1 if problem.loads is None else LOAD_INCREMENTS
-    measures = Measures(work, turn, dot if problem.follows_rate or problem.softens else None)
-    return damped_newton(evaluate, measures, first, floor, shares, stages=HARDENING_STAGES if problem.softens else 0)
+    measures = Measures(work, turn, dot if problem.follows_rate else None)
+    return damped_newton(evaluate, measures, first, floor, shares)
 
 
 def _doubtful(J: Array, elastic: Array) -> Array:

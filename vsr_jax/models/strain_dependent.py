@@ -141,6 +141,14 @@ class StrainDependent(SteppedModel):
             state.shares_at(scene, grid, grid.X, forces),
         )
 
+    def balance(
+        self, scene: Scene, forces: Forces, state: ArmSolution
+    ) -> tuple[ArmProblem, ArmUnknown]:
+        grid = self.grid(scene)
+        loads = super().loading(scene, state, grid)
+        problem = ArmProblem(grid, scene.sections(grid.X), forces, loads, state.couplings)
+        return problem, ArmUnknown(state.xi, state.coupled)
+
     def loading(self, scene: Scene, state: ArmSolution, grid: Grid) -> Loading | None:
         return state.loading(super().loading(scene, state, grid))
 

@@ -9,14 +9,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..arm.scene import Scene
+from ..mechanics.arm_balance import ArmUnknown
 from ..mechanics.balance import forces_where
 from ..mechanics.cable import cable_of, path_length
-from ..mechanics.reaction import loading, react_at
+from ..mechanics.coupling import ArmProblem
+from ..mechanics.reaction import react_at
 from ..models.base import Model, Nodes, Outcome, Status
 from ..numerics import component as c
 from ..numerics.component import Vector
 from ..typing import Pose, Scalar, VectorLike
 from ..validation import is_traced, on_arm
+from .bearing import Contact, contacts_of, supported, supports_of
 from .energy import Energy, energy_of
 from .estimate import Error, error_of
 from .quantities import (
@@ -27,7 +30,7 @@ from .quantities import (
     quantity,
     structure,
 )
-from .stability import extreme
+from .stability import extreme, extreme_supported
 from .summary import Summary, summary_of, values_of
 
 
@@ -115,7 +118,7 @@ class Equilibrium(Solved):
         r"""Internal wrench $\Lambda(X) = (M, N)$ in the body frame that balances the loads beyond
         X. The rod and the threads carry it together."""
         nodes = self.nodes
-        loads = loading(self.scene, nodes.grid)
+        loads = self.model.loading(self.scene, self.state, nodes.grid)
         if loads is None:
             return jnp.zeros((X.size, 6), X.dtype)
         return c.join(react_at(nodes.xi, nodes.grid, loads, X))
@@ -135,14 +138,24 @@ class Equilibrium(Solved):
         that the residual stays above the square root of machine epsilon. It has no derivative where
         the least eigenvalue is multiple.
         """
-        return extreme(self.scene, self.sound_forces, self.nodes)
+        return self._extreme(greatest=False)
 
     @quantity("1")
     def condition(self) -> Scalar:
         """Condition number of the scaled tangent stiffness of `stability`: it magnifies
         rounding."""
-        greatest = extreme(self.scene, self.sound_forces, self.nodes, greatest=True)
-        return greatest / jnp.abs(self.stability)
+        return self._extreme(greatest=True) / jnp.abs(self.stability)
+
+    @structure("N m and N")
+    def supports(self) -> Float[Array, "supports 6"]:
+        """Support reactions: the moment [N m] and force [N] in the world frame by which each held
+        section is held."""
+        return supports_of(*self._balance)
+
+    @structure("m and N")
+    def contacts(self) -> Contact:
+        """Contacts with the obstacles: where, gap [m] and force [N]."""
+        return contacts_of(*self._balance)
 
     @structure("m, and as the strain")
     def error(self) -> Error:
@@ -252,6 +265,15 @@ class Equilibrium(Solved):
     def nodes(self) -> Nodes:
         """Quadrature points of the model, with the strain and the cross-sections there."""
         return self.model.nodes(self.scene, self.sound_forces, self.state)
+
+    @property
+    def _balance(self) -> tuple[ArmProblem, ArmUnknown]:
+        return self.model.balance(self.scene, self.sound_forces, self.state)
+
+    def _extreme(self, *, greatest: bool) -> Scalar:
+        if self.scene.held or self.scene.obstacles:
+            return extreme_supported(supported(*self._balance, self.scene.free), greatest=greatest)
+        return extreme(self.scene, self.sound_forces, self.nodes, greatest=greatest)
 
     def _ends(self, index: int) -> tuple[Any, Any]:
         """Abscissas [m] of the start and the end of a thread."""

@@ -42,6 +42,12 @@ from ..numerics.lanczos import Operator, extreme_pairs
 from ..numerics.quadrature import Grid, beyond, gauss_legendre
 from ..numerics.se3 import exp_coefficients, stacked_rotation
 from ..numerics.stacked import cross
+from .bearing import Supported
+
+
+def extreme_supported(arm: Supported, *, greatest: bool = False) -> Array:
+    """As `extreme`, of an arm with held sections or contacts."""
+    return _extreme(arm, -1 if greatest else 0)
 
 
 def extreme(scene: Scene, forces: Vector, nodes: Nodes, *, greatest: bool = False) -> Array:
@@ -104,7 +110,7 @@ class Arm(eqx.Module):
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(1,))
-def _extreme(arm: Arm, place: int) -> Array:
+def _extreme(arm: Arm | Supported, place: int) -> Array:
     return extreme_pairs(arm.tangent()).values[place]
 
 

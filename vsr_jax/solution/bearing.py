@@ -1,0 +1,149 @@
+"""What holds an arm and what it touches: support reactions, contacts, and the tangent of an arm that
+they constrain."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..mechanics.arm_balance import ArmUnknown, imbalance_of, state_of
+from ..mechanics.balance import free_components, spread
+from ..mechanics.contact import Contacts
+from ..mechanics.coupling import ArmProblem
+from ..mechanics.held import Holds
+from ..numerics import lu
+from ..numerics.component import Vector
+from ..numerics.lanczos import Operator
+
+
+class Contact(NamedTuple):
+    """Contact of each obstacle with each step along the arm, where the gap is least.
+
+    **Fields**, the obstacles in the first axis and the steps in the second: abscissa `X` [m];
+    `position` [m] of the axis in the world; `normal` of the obstacle; `gap` [m] between the outline
+    and the obstacle; `force` [N] along the normal, at most rounding where they do not touch.
+    """
+
+    X: Float[Array, "obstacles steps"]
+    position: Float[Array, "obstacles steps 3"]
+    normal: Float[Array, "obstacles steps 3"]
+    gap: Float[Array, "obstacles steps"]
+    force: Float[Array, "obstacles steps"]
+
+
+def supports_of(problem: ArmProblem, unknown: ArmUnknown) -> Float[Array, "supports 6"]:
+    """Moment and force in the world frame by which each held section is held."""
+    for coupling, x in zip(problem.couplings, unknown.coupled, strict=True):
+        if isinstance(coupling, Holds):
+            return coupling.wrenches(x)
+    return jnp.zeros((0, 6), unknown.xi[0].dtype)
+
+
+def contacts_of(problem: ArmProblem, unknown: ArmUnknown) -> Contact:
+    """The contacts of an arm."""
+    touch = None
+    at = state_of(unknown.xi, unknown.coupled, problem)
+    touch = None if at.along is None else at.along.touch
+    grid = problem.grid
+    if touch is None:
+        none = jnp.zeros((0, grid.h.size), grid.h.dtype)
+        vectors = jnp.zeros((0, grid.h.size, 3), grid.h.dtype)
+        return Contact(none, vectors, vectors, none, none)
+    return Contact(
+        grid.start + touch.sigma * grid.h,
+        jnp.moveaxis(touch.place, 0, -1),
+        jnp.moveaxis(touch.normal, 0, -1),
+        touch.gap,
+        touch.force,
+    )
+
+
+class Supported(eqx.Module):
+    """An arm with what holds it and what it touches; `units` scales changes of the free strains,
+    and `ties` are the scaled changes that held sections, contacts and taut cables prevent."""
+
+    problem: ArmProblem
+    unknown: ArmUnknown
+    units: Float[Array, "strains stages steps"]
+    ties: Float[Array, "ties strains stages steps"]
+    free: tuple[int, ...] = eqx.field(static=True)
+
+    def tangent(self) -> "SupportedTangent":
+        """The scaled tangent as an operator."""
+        return SupportedTangent(self)
+
+    def form(self, v: Array) -> Array:
+        """$v^T S v$ with S the scaled tangent."""
+        return jnp.sum(v * self.times(self.allowed(v)))
+
+    def times(self, v: Array) -> Array:
+        """The scaled tangent, where the wrenches of supports and contacts keep their sizes."""
+        weight = self.problem.grid.weight
+
+        def imbalance(v: Array) -> Array:
+            change = spread(tuple(self.units * v), self.free)
+            xi = tuple(x + y for x, y in zip(self.unknown.xi, change, strict=True))
+            unknown = self.unknown._replace(xi=xi)
+            at = state_of(xi, unknown.coupled, self.problem)
+            return jnp.stack(imbalance_of(unknown, at, self.problem, self.free).wrench)
+
+        return weight * self.units * jax.jvp(imbalance, (jnp.zeros_like(v),), (v,))[1]
+
+    def allowed(self, v: Array) -> Array:
+        """Orthogonal projection onto the changes that nothing prevents."""
+        v = jnp.where(self.units > 0, v, 0.0)
+        rows = self.ties.reshape(len(self.ties), -1)
+        gram = rows @ rows.T + jnp.diag(jnp.where(jnp.any(rows != 0, axis=1), 0.0, 1.0))
+        eps = jnp.finfo(rows.dtype).eps
+        gram = gram + 16 * eps * jnp.diag(jnp.diagonal(gram))
+        prevented = rows.T @ lu.solve(gram, rows @ v.reshape(-1))
+        return v - prevented.reshape(v.shape)
+
+
+class SupportedTangent(Operator):
+    """Symmetric part of the scaled tangent of a `Supported` arm."""
+
+    arm: Supported
+
+    @property
+    def like(self) -> Array:
+        return self.arm.units
+
+    def allowed(self, v: Array) -> Array:
+        return self.arm.allowed(v)
+
+    def times(self, v: Array) -> Array:
+        back = jax.linear_transpose(self.arm.times, self.like)
+        v = self.allowed(v)
+        return self.allowed(0.5 * (self.arm.times(v) + back(v)[0]))
+
+
+def supported(problem: ArmProblem, unknown: ArmUnknown, free: tuple[int, ...]) -> Supported:
+    """The arm of a solution with what holds it."""
+    grid, stiffness = problem.grid, problem.sections.stiffness
+    scale = jnp.stack([jnp.broadcast_to(s, grid.X.shape) for s in free_components(stiffness, free)])
+    there = grid.weight > 0
+    units = jnp.where(there, 1 / jnp.sqrt(jnp.where(there, grid.weight, 1.0) * scale), 0.0)
+    at = state_of(unknown.xi, unknown.coupled, problem)
+    ties = []
+    for coupling, x, note in zip(problem.couplings, unknown.coupled, at.notes, strict=True):
+        border = coupling.border(x, at, note, problem)
+        if border is None:
+            continue
+        rows = _scaled(border.rows, grid.weight * units, free)
+        holds = (border.factors != 0) & (border.corner < _HOLDING)
+        size = jnp.sqrt(jnp.sum(rows**2, axis=(1, 2, 3), keepdims=True))
+        fixed = holds[:, None, None, None] & (size > 0)
+        ties.append(jnp.where(fixed, rows / jnp.where(fixed, size, 1.0), 0.0))
+    return Supported(problem, unknown, units, jnp.concatenate(ties), free)
+
+
+_HOLDING = 0.5
+"""Entry in the corner of a border below which its row holds the arm: 1 where it does not."""
+
+
+def _scaled(rows: Vector, units: Array, free: tuple[int, ...]) -> Array:
+    """Rows of a border by scaled changes, (ties, strains, stages, steps)."""
+    return jnp.stack(free_components(rows, free), axis=1) * units
