@@ -22,7 +22,6 @@ from ..typing import ArrayLike, MatrixLike, Pose, Scalar, VectorLike
 from ..validation import concrete, numbers, rigid
 from .description import Part
 from .functions import Position, function_of_position
-from .rod import Rod
 
 
 class Obstacle(Part):
@@ -42,10 +41,11 @@ class Obstacle(Part):
         """The numbers that must be positive, by name."""
         return {}
 
-    def check(self, name: str, rod: Rod, X: Float[Array, " stations"]) -> None:
-        """Raises `ValueError` if `rod` has no room, for known numbers.
+    def check(self, name: str, outline: float) -> None:
+        """Raises `ValueError` if an arm has no room, for known numbers. A scene calls this.
 
-        **Arguments:** `name`: the obstacle's name in messages; `X`: stations along the rod [m].
+        **Arguments:** `name`: the obstacle's name in messages; `outline`: radius of the arm's
+        outline [m] where it is greatest.
         """
 
 

@@ -15,7 +15,6 @@ from ..validation import concrete, numbers, rigid
 from .functions import Position
 from .obstacles import Obstacle, local_point
 from .profile import Constant, Profile, ProfileLike, as_profile
-from .rod import Rod
 from .spline import hermite_value, spline_slopes
 
 _SAMPLES = 8
@@ -77,13 +76,12 @@ class Tube(Obstacle):
         rate, slope = _stationarity(curve, local, s)
         return curve.depth(local, s - rate / lax.stop_gradient(slope))
 
-    def check(self, name: str, rod: Rod, X: Float[Array, " stations"]) -> None:
-        widest = concrete(jnp.max(jax.vmap(rod.outline)(X)))
+    def check(self, name: str, outline: float) -> None:
         narrowest = concrete(jnp.min(self.radii))
-        if widest is not None and narrowest is not None and not narrowest > widest:
+        if narrowest is not None and not narrowest > outline:
             raise ValueError(
                 f"{name}.radius: got {narrowest:g} m at the narrowest place, need more than the "
-                f"{widest:g} m of the outline of the arm at the widest"
+                f"radius of the arm's outline, {outline:g} m"
             )
 
     @property
@@ -159,7 +157,7 @@ def _nearest(curve: Curve, point: Position) -> Scalar:
     beyond = 2 * (curve.knots[-1] + jnp.max(jnp.abs(point - curve.points)))
     ends = jnp.concatenate([-beyond[None], samples, (curve.knots[-1] + beyond)[None]])
 
-    def improve(_: int, bracket: tuple[Scalar, Scalar, Scalar]) -> tuple[Scalar, Scalar, Scalar]:
+    def improve(_: Array, bracket: tuple[Scalar, Scalar, Scalar]) -> tuple[Scalar, Scalar, Scalar]:
         low, s, high = bracket
         rate, slope = _stationarity(curve, point, s)
         low, high = jnp.where(rate > 0, s, low), jnp.where(rate > 0, high, s)
