@@ -9,6 +9,7 @@ an obstacle where the distance of its axis is the radius of its outline, `Rod.ou
 
 from abc import abstractmethod
 from collections.abc import Callable
+from functools import reduce
 from typing import ClassVar
 
 import equinox as eqx
@@ -62,7 +63,10 @@ def _distance_beyond(over: Float[Array, " sides"]) -> Scalar:
     """Distance to a box, or to what it is a section of, from the components by which a point is
     beyond each pair of its sides."""
     outside = jnp.where(over > 0, over, 0.0)
-    return jnp.where(jnp.all(over <= 0), jnp.max(over), norm(split(outside)))
+    # the derivative of jnp.max divides by the number of equal components, which is zero if XLA
+    # recomputes them with other rounding
+    inside = reduce(jnp.maximum, split(over))
+    return jnp.where(inside <= 0, inside, norm(split(outside)))
 
 
 class Plane(Obstacle):
