@@ -402,12 +402,8 @@ def test_errors(make, message, unchecked):
 
 
 def test_scene_files():
-    scene = eqx.tree_at(lambda s: s.obstacles, SCENE, SCENE.obstacles[:5])
-    text = to_toml(scene)
-    assert text.count("[[obstacles]]") == 5
-    read = parse_scene(text).scene
-    assert eqx.tree_equal(read, scene)
-    assert to_toml(read) == text
+    text = to_toml(vsr.Scene(arm(), obstacles=SCENE.obstacles[:5]))
+    assert eqx.tree_equal(parse_scene(text).scene.obstacles, SCENE.obstacles[:5])
     with pytest.raises(ValueError, match=r"^obstacles\[5\]: a Field cannot be stored in a scene"):
         to_toml(SCENE)
     with pytest.raises(ValueError, match=r"^obstacles\[0\]: unknown type 'Spere', .* 'Sphere'\?$"):
