@@ -6,6 +6,7 @@ import re
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from conftest import central_differences, epsilon
@@ -15,6 +16,9 @@ from scipy.spatial import cKDTree
 import vsr_jax as vsr
 from vsr_jax.arm import Obstacle
 from vsr_jax.files.scene_file import parse_scene, to_toml
+from vsr_jax.viewer.mesh import polygons
+from vsr_jax.viz import plot
+from vsr_jax.viz.obstacles import Region, polygons_of
 
 TURNED = vsr.pose((0.05, -0.02, 0.03), pointing=(0.3, -0.5, 0.9), roll=0.4)
 LINE = np.array([[0, 0, 0], [0.08, 0.01, 0], [0.15, 0.02, 0.05], [0.18, -0.03, 0.1], [0.2, 0, 0.2]])
@@ -423,3 +427,48 @@ def test_an_obstacle_of_a_user():
     assert vsr.Scene(arm(), obstacles=Wall()).effects == ("wall",)
     with pytest.raises(ValueError, match=r"0\.06 m inside the wall at X = 0 m"):
         vsr.Scene(arm(base=vsr.pose((0, 0, -0.1))), obstacles=Wall())
+
+
+def test_drawn_surfaces_lie_on_the_obstacle(obstacle):
+    points = np.array([[-0.1, -0.1, 0.0], [0.2, 0.1, 0.15]])
+    polygons = polygons_of(obstacle, points)
+    if isinstance(obstacle, vsr.Field):
+        assert polygons == []
+        return
+    corners = np.concatenate(polygons)
+    assert len(polygons) == 1 or np.min(np.ptp(corners, axis=0)) > 0.05
+    # clipped polygons have corners within the facets of a curved surface, the caps of a cylinder
+    # and of a box corners within the surface
+    region = Region(points)
+    assert np.all((corners >= region.low - 1e-12) & (corners <= region.high + 1e-12))
+    whole = np.all((corners > region.low + 1e-9) & (corners < region.high - 1e-9), axis=1)
+    assert np.max(np.abs(distances(obstacle, corners[whole]))) < 1e-9
+    assert np.max(np.abs(distances(obstacle, corners))) < 2e-3
+
+
+def test_a_large_obstacle_is_drawn_near_the_points():
+    large = vsr.Sphere((0.0, 0.0, -50.0), 49.9)
+    corners = np.concatenate(polygons_of(large, np.array([[-0.1, 0.0, 0.0], [0.1, 0.0, 0.1]])))
+    assert np.max(np.abs(corners)) < 0.3
+    np.testing.assert_allclose(corners[:, 2], -0.1, atol=2e-3)
+    far = vsr.Sphere((0.0, 0.0, -50.0), 49.0)
+    assert polygons_of(far, np.array([[-0.1, 0.0, 0.0], [0.1, 0.0, 0.1]])) == []
+
+
+def test_triangles_of_polygons_have_their_area():
+    square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)
+    mesh = polygons([square, square[:3] + 2.0])
+    a, b, c = np.moveaxis(mesh.vertices[mesh.triangles], 1, 0)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    np.testing.assert_allclose(area, [0.5, 0.5, 0.5])
+    assert polygons([]).triangles.shape == (0, 3)
+
+
+def test_a_workspace_among_obstacles():
+    tips = np.random.default_rng(0).normal(scale=0.05, size=(200, 3))
+    bare, among = (
+        plot.workspace(tips, obstacles=obstacles) for obstacles in ((), SCENE.obstacles[:5])
+    )
+    added = [len(b.collections) - len(a.collections) for a, b in zip(bare, among, strict=True)]
+    assert added == [5, 5, 5, 5]
+    plt.close("all")

@@ -212,8 +212,8 @@ MISTAKES = [
     (
         "[rod]",
         "[road]",
-        r"^unknown key 'road', known are actuators, free_strains, inputs, loads, obstacles, rod, title; did "
-        r"you mean 'rod'\?$",
+        r"^unknown key 'road', known are actuators, free_strains, inputs, loads, obstacles, rod, "
+        r"title; did you mean 'rod'\?$",
     ),
     (
         '"Circular"',

@@ -162,7 +162,7 @@ def _(obstacle: Tube, region: Region) -> Polygons:
     s = np.linspace(0.0, float(curve.knots[-1]), _ALONG + 1).astype(curve.knots.dtype)
     centre, tangent, width, widening = (
         np.asarray(x, float)
-        for f in (curve.position, curve.width)
+        for f in (curve.position, lambda s: curve.radius(s, curve.knots[-1]))
         for x in jax.vmap(lambda at, f=f: jax.jvp(f, (at,), (at * 0 + 1,)))(s)
     )
     slope = np.clip(widening / np.linalg.norm(tangent, axis=1), -1.0, 1.0)
