@@ -6,18 +6,22 @@ import re
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import matplotlib.pyplot as plt
+import matplotlib as mpl
 import numpy as np
 import pytest
 from conftest import central_differences, epsilon
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
+mpl.use("Agg")
+
+import matplotlib.pyplot as plt
+
 import vsr_jax as vsr
 from vsr_jax.arm import Obstacle
 from vsr_jax.files.scene_file import parse_scene, to_toml
 from vsr_jax.viewer.mesh import polygons
-from vsr_jax.viz import plot
+from vsr_jax.viz import annotate, plot
 from vsr_jax.viz.obstacles import Region, polygons_of
 
 TURNED = vsr.pose((0.05, -0.02, 0.03), pointing=(0.3, -0.5, 0.9), roll=0.4)
@@ -437,13 +441,15 @@ def test_drawn_surfaces_lie_on_the_obstacle(obstacle):
         return
     corners = np.concatenate(polygons)
     assert len(polygons) == 1 or np.min(np.ptp(corners, axis=0)) > 0.05
-    # clipped polygons have corners within the facets of a curved surface, the caps of a cylinder
-    # and of a box corners within the surface
     region = Region(points)
     assert np.all((corners >= region.low - 1e-12) & (corners <= region.high + 1e-12))
+    off = np.abs(distances(obstacle, corners))
+    assert np.max(off) < 2e-3  # of corners within a facet that was clipped
     whole = np.all((corners > region.low + 1e-9) & (corners < region.high - 1e-9), axis=1)
-    assert np.max(np.abs(distances(obstacle, corners[whole]))) < 1e-9
-    assert np.max(np.abs(distances(obstacle, corners))) < 2e-3
+    if getattr(obstacle, "line", None) is not None:  # without the ends, where the wall has kinks
+        whole[:96] = whole[-96:] = False
+    assert np.sum(whole) > 10 or isinstance(obstacle, vsr.Plane)
+    assert np.max(off[whole], initial=0.0) < 1e-9
 
 
 def test_a_large_obstacle_is_drawn_near_the_points():
@@ -471,4 +477,28 @@ def test_a_workspace_among_obstacles():
     )
     added = [len(b.collections) - len(a.collections) for a, b in zip(bare, among, strict=True)]
     assert added == [5, 5, 5, 5]
+    plt.close("all")
+
+
+def test_arms_and_films_among_obstacles(tmp_path):
+    """Each obstacle is one more collection; none without details."""
+    model = vsr.StrainDependent(4)
+    scenes = [vsr.Scene(arm(), obstacles=obstacles) for obstacles in ((), SCENE.obstacles[:3])]
+    bare, among = (vsr.solve(scene, [], model=model) for scene in scenes)
+
+    def count(ax):
+        number = len(ax.collections)
+        plt.close(ax.figure)
+        return number
+
+    assert count(plot.arm(among)) - count(plot.arm(bare)) == 3
+    given = plot.arm(bare)
+    assert count(plot.arm(among, details=False)) == count(plot.arm(bare, details=False))
+    before = len(given.collections)
+    assert len(annotate.obstacles(among, given).collections) == before + 3
+    counts = []
+    for name, eq in (("bare", bare), ("among", among)):
+        film = vsr.film([eq, eq], tmp_path / f"{name}.gif", dpi=20)
+        counts.append(len(film._fig.axes[0].collections))
+    assert counts[1] - counts[0] == 3
     plt.close("all")

@@ -69,7 +69,7 @@ def discs(rims: Float[np.ndarray, "discs angles 3"]) -> Mesh:
     return Mesh(np.concatenate([rims.reshape(-1, 3), rims.mean(axis=1)]), triangles)
 
 
-def polygons(corners: Sequence[Float[np.ndarray, "corners 3"]]) -> Mesh:
+def polygons(corners: Sequence[Float[np.ndarray, "_ 3"]]) -> Mesh:
     """Convex polygons, each as triangles that share its first corner."""
     first = np.cumsum([0, *(len(polygon) for polygon in corners)])
     fans = [

@@ -15,7 +15,7 @@ from ..arm.obstacles import Box, Cylinder, Obstacle, Plane, Sphere
 from ..arm.tube import Tube, curve_through
 from .style import COLORS, ink, mixed
 
-Polygons = list[Float[np.ndarray, "corners 3"]]
+Polygons = list[Float[np.ndarray, "_ 3"]]
 """Convex polygons [m]."""
 
 COLOR = COLORS[5]
@@ -79,11 +79,13 @@ def draw_outlines(
     points: Float[np.ndarray, "points 3"],
     axes: tuple[int, int],
 ) -> None:
-    """Areas that obstacles cover in a projection, whose horizontal and vertical axis are given."""
+    """Areas that obstacles cover in a projection, whose horizontal and vertical axis are given; of
+    planes the line where they are seen from the side, and the outline of what is drawn of them."""
     color = mixed(ink(0.0), COLOR, _FILL)
     for obstacle in obstacles:
         flat = [polygon[:, axes] for polygon in polygons_of(obstacle, points)]
-        ax.add_collection(PolyCollection(flat, facecolor=color, edgecolor=color, zorder=0))
+        fill = "none" if isinstance(obstacle, Plane) else color
+        ax.add_collection(PolyCollection(flat, facecolor=fill, edgecolor=color, zorder=0))
 
 
 @singledispatch
