@@ -137,7 +137,7 @@ def check_obstacles(
         j = int(np.argmin(gap))
         if not gap[j] > -ROUNDING * X[-1]:
             where, needed = (
-                ("outside", "an arm that starts in the tube")
+                ("outside", f"an arm that starts in the {obstacle.effect}")
                 if obstacle.encloses
                 else ("inside", "an arm that is outside at rest")
             )

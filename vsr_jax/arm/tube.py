@@ -27,10 +27,10 @@ class Tube(Obstacle):
     r"""A lumen inside which the arm runs, $d = \max_s (R(s) - |r - c(s)|)$: the union of the balls
     of radius R(s) about the points of a centre line c(s), positive inside.
 
-    It is the exact distance from the wall for points outside the wall, and for points inside that
-    are nearer to the wall than the wall's radius of curvature. With a constant radius the section
-    across the line is a circle of that radius. The lumen is open: beyond the ends it continues
-    straight. The arm must be inside it at X = 0 and may be outside elsewhere at rest.
+    Outside the lumen this is the exact distance to it. Inside, it never exceeds the distance to the
+    wall, and equals it where the line bends less sharply than the lumen is wide. The lumen is open:
+    beyond the ends it continues straight. The arm must be inside it at X = 0 and may be outside
+    elsewhere at rest.
 
     **Arguments:**
     - `radius`: $R$ [m], a number, or with a line a profile without jumps of the abscissa s along

@@ -141,7 +141,7 @@ class Stage:
     def _draw_obstacles(self, scene: Scene) -> None:
         """Draws the obstacles where the arm can be, and again where one changes."""
         base = np.zeros(3) if scene.rod.base is None else np.asarray(scene.rod.base)[:3, 3]
-        around = base + self._length * np.stack([-np.ones(3), np.ones(3)])
+        around = base + 0.5 * self._length * np.stack([-np.ones(3), np.ones(3)])
         for i, obstacle in enumerate(scene.obstacles):
             known = self._obstacles[i] if self._obstacles else None
             if not eqx.tree_equal(obstacle, known):

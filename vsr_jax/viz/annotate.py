@@ -92,8 +92,8 @@ def loads(
 
 
 def obstacles(eq: Equilibrium, ax: Axes3D | None = None, *, stations: int = 60) -> Axes3D:
-    """The obstacles around an arm as translucent surfaces. Endless ones are drawn near the arm, as
-    are the parts of others; a `Field` is not drawn.
+    """The obstacles around an arm as translucent surfaces. Of endless ones the part near
+    the arm is drawn, as of a `Field`.
 
     **Arguments:** `ax`: 3D axes, new ones by default; `stations`: number of stations of the arm.
 

@@ -3,9 +3,11 @@
 from collections.abc import Sequence
 from functools import singledispatch
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
@@ -13,6 +15,7 @@ from mpl_toolkits.mplot3d.axes3d import Axes3D
 
 from ..arm.obstacles import Box, Cylinder, Obstacle, Plane, Sphere
 from ..arm.tube import Tube, curve_through
+from ..typing import Scalar
 from .style import COLORS, ink, mixed
 
 Polygons = list[Float[np.ndarray, "_ 3"]]
@@ -23,6 +26,8 @@ _FILL = 0.3
 """Strength of the colour in projections."""
 _ANGLES, _ALONG = 24, 48
 """Facets around an obstacle and along one."""
+_CELLS, _PROJECTIONS = 64, 3
+"""Cells along the longest side of the grid of a level set, and steps onto the surface."""
 _ENDLESS, _FARTHEST = 0.25, 0.6
 """How far endless obstacles, and others, are drawn beyond the points of interest, relative to the
 extent of these."""
@@ -46,7 +51,7 @@ class Region:
 
 
 def polygons_of(obstacle: Obstacle, points: Float[np.ndarray, "points 3"]) -> Polygons:
-    """The surface of an obstacle near points [m], shape (points, 3); none for a `Field`."""
+    """The surface of an obstacle near points [m], shape (points, 3)."""
     region = Region(points)
     return [
         clipped
@@ -90,7 +95,46 @@ def draw_outlines(
 
 @singledispatch
 def _surface(obstacle: Obstacle, region: Region) -> Polygons:
-    return []
+    """Polygons of the surface, by default of the level set of the distance on a grid: one corner in
+    each cell that it passes, and a quadrilateral around each edge of the grid that it crosses
+    (surface nets, Gibson 1998)."""
+    low, high = region.low, region.high
+    step = np.max(high - low) / _CELLS
+    number = np.ceil((high - low) / step).astype(int) + 1
+    nodes = np.stack(np.meshgrid(*map(np.arange, number), indexing="ij"), axis=-1)
+    points = jnp.asarray((low + step * nodes).reshape(-1, 3))
+    inside = np.asarray(_distances(obstacle, points)).reshape(number) < 0
+    quads = []
+    for axis in range(3):
+        crossed = np.diff(inside, axis=axis)
+        across = [i for i in range(3) if i != axis]
+        cells = np.argwhere(crossed)
+        cells = cells[np.all((cells[:, across] > 0) & (cells < number - 1)[:, across], axis=1)]
+        corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) @ np.eye(3, dtype=int)[across]
+        quads.append(cells[:, None] - corners)
+    middles = jnp.asarray(low + step * (np.concatenate(quads).reshape(-1, 3) + 0.5))
+    corners = _projected(obstacle, middles, jnp.asarray(step))
+    return list(np.asarray(corners, float).reshape(-1, 4, 3))
+
+
+@eqx.filter_jit
+def _distances(obstacle: Obstacle, points: Array) -> Array:
+    return jax.vmap(obstacle.distance)(points)
+
+
+@eqx.filter_jit
+def _projected(obstacle: Obstacle, points: Array, step: Scalar) -> Array:
+    """Points moved to the surface along its normal, at most by a step [m] at a time."""
+
+    def moved(point: Array) -> Array:
+        distance, normal = jax.value_and_grad(obstacle.distance)(point)
+        square = jnp.sum(normal**2)
+        shift = distance / jnp.where(square > 0, square, 1.0)
+        return point - jnp.clip(shift, -step, step) * normal
+
+    for _ in range(_PROJECTIONS):
+        points = jax.vmap(moved)(points)
+    return points
 
 
 @_surface.register
