@@ -17,6 +17,7 @@ MOST_LINES = 30
 HEADINGS = [
     "A load",
     "A load that depends on the pose",
+    "An obstacle",
     "A routing",
     "A basis",
     "A model",

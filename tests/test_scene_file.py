@@ -90,7 +90,16 @@ def full_scene() -> vsr.Scene:
         vsr.MagneticDensity((vsr.Taper(0.1, 0.2), 0.0, 0.1), (0.0, 1 / 3, 0.0)),
         vsr.Spinning((0.0, 0.0, 2 / 3)),
     ]
-    return vsr.Scene(rod, actuators, loads, free_strains=("bending_y", "bending_z", "elongation"))
+    away = vsr.pose((3.0, 1 / 3, 0.0), pointing=(1.0, 2.0, 3.0))
+    obstacles = [
+        vsr.Plane((0.0, 1.0, 1 / 3), (0.0, -3.0, 0.0)),
+        vsr.Sphere((2.0, 0.0, 1 / 3), 1 / 7),
+        vsr.Cylinder(0.1, length=1 / 3, pose=away),
+        vsr.Box((0.1, 0.2, 1 / 3), pose=away, rounding=0.01),
+        vsr.Tube(vsr.Taper(5.0, 4.0), [[-1.0, 0.0, 0.0], [0.0, 1 / 3, 0.0], [2.0, 0.0, 1.0]]),
+    ]
+    free = ("bending_y", "bending_z", "elongation")
+    return vsr.Scene(rod, actuators, loads, free_strains=free, obstacles=obstacles)
 
 
 def test_every_class_comes_back_to_the_last_bit():
@@ -203,8 +212,8 @@ MISTAKES = [
     (
         "[rod]",
         "[road]",
-        r"^unknown key 'road', known are actuators, free_strains, inputs, loads, rod, title; did "
-        r"you mean 'rod'\?$",
+        r"^unknown key 'road', known are actuators, free_strains, inputs, loads, obstacles, rod, "
+        r"title; did you mean 'rod'\?$",
     ),
     (
         '"Circular"',

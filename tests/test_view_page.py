@@ -124,6 +124,22 @@ def test_a_collapsed_arm_is_dimmed_and_two_views_have_two_ports(page, scene):
         assert other.url != page.url
 
 
+@pytest.mark.slow
+def test_obstacles_follow_their_numbers(scene):
+    ball = vsr.Sphere((0.15, 0.1, 0.1), 0.03)
+    among = vsr.Scene(
+        scene.rod, scene.actuators, obstacles=[vsr.Plane((0, 0, 1), (0, 0, -0.1)), ball]
+    )
+    name = "obstacles[1].radius"
+    options = {"model": MODEL, "port": free_port(), "browser": False, "block": False}
+    with vsr.view(among, INPUTS, numbers=[name], **options) as page:
+        page.move({}).wait()
+        np.testing.assert_allclose(node(page, "/obstacles/0").vertices[:, 2], -0.1, atol=1e-6)
+        page.move({name: 0.04}).wait()
+        away = np.linalg.norm(node(page, "/obstacles/1").vertices - ball.centre, axis=1)
+        np.testing.assert_allclose(away, 0.04, atol=1e-6)
+
+
 class Browser:
     """A page in Chromium."""
 

@@ -9,6 +9,7 @@ an obstacle where the distance of its axis is the radius of its outline, `Rod.ou
 
 from abc import abstractmethod
 from collections.abc import Callable
+from functools import reduce
 from typing import ClassVar
 
 import equinox as eqx
@@ -22,7 +23,6 @@ from ..typing import ArrayLike, MatrixLike, Pose, Scalar, VectorLike
 from ..validation import concrete, numbers, rigid
 from .description import Part
 from .functions import Position, function_of_position
-from .rod import Rod
 
 
 class Obstacle(Part):
@@ -42,10 +42,11 @@ class Obstacle(Part):
         """The numbers that must be positive, by name."""
         return {}
 
-    def check(self, name: str, rod: Rod, X: Float[Array, " stations"]) -> None:
-        """Raises `ValueError` if `rod` has no room, for known numbers.
+    def check(self, name: str, outline: float) -> None:
+        """Raises `ValueError` if an arm has no room, for known numbers. A scene calls this.
 
-        **Arguments:** `name`: the obstacle's name in messages; `X`: stations along the rod [m].
+        **Arguments:** `name`: the obstacle's name in messages; `outline`: radius of the arm's
+        outline [m] where it is greatest.
         """
 
 
@@ -62,7 +63,10 @@ def _distance_beyond(over: Float[Array, " sides"]) -> Scalar:
     """Distance to a box, or to what it is a section of, from the components by which a point is
     beyond each pair of its sides."""
     outside = jnp.where(over > 0, over, 0.0)
-    return jnp.where(jnp.all(over <= 0), jnp.max(over), norm(split(outside)))
+    # the derivative of jnp.max divides by the number of equal components, which is zero if XLA
+    # recomputes them with other rounding
+    inside = reduce(jnp.maximum, split(over))
+    return jnp.where(inside <= 0, inside, norm(split(outside)))
 
 
 class Plane(Obstacle):

@@ -134,8 +134,9 @@ def check_obstacles(
     """
     if not obstacles:
         return
-    X, positions, radii = jax.tree.map(concrete, _at_rest(rod, edges()))
-    if X is None:
+    X, positions, outline = _at_rest(rod, edges())
+    X, radii = concrete(X), concrete(outline)
+    if X is None or radii is None:
         return
     for i, obstacle in enumerate(obstacles):
         name = f"Scene.obstacles[{i}]"
@@ -143,7 +144,7 @@ def check_obstacles(
             known = concrete(value)
             if known is not None and not known > 0:
                 raise ValueError(f"{name}.{size}: got {known:g}, need a number > 0")
-        obstacle.check(name, rod, X)
+        obstacle.check(name, float(np.max(radii)))
         stations = slice(0, 1) if obstacle.encloses else slice(None)
         distances = concrete(_distances(obstacle, positions[stations]))
         if distances is None:
@@ -152,7 +153,7 @@ def check_obstacles(
         j = int(np.argmin(gap))
         if not gap[j] > -ROUNDING * X[-1]:
             where, needed = (
-                ("outside", "an arm that starts in the tube")
+                ("outside", f"an arm that starts in the {obstacle.effect}")
                 if obstacle.encloses
                 else ("inside", "an arm that is outside at rest")
             )

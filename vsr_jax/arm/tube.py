@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..numerics.component import norm, split
 from ..typing import MatrixLike, Pose, Scalar
@@ -15,7 +15,6 @@ from ..validation import concrete, numbers, rigid
 from .functions import Position
 from .obstacles import Obstacle, local_point
 from .profile import Constant, Profile, ProfileLike, as_profile
-from .rod import Rod
 from .spline import hermite_value, spline_slopes
 
 _SAMPLES = 8
@@ -28,13 +27,14 @@ class Tube(Obstacle):
     r"""A lumen inside which the arm runs, $d = \max_s (R(s) - |r - c(s)|)$: the union of the balls
     of radius R(s) about the points of a centre line c(s), positive inside.
 
-    It is the exact distance from the wall for points outside the wall, and for points inside that
-    are nearer to the wall than the wall's radius of curvature. With a constant radius the section
-    across the line is a circle of that radius. The lumen is open: beyond the ends it continues
-    straight. The arm must be inside it at X = 0 and may be outside elsewhere at rest.
+    Outside the lumen this is the exact distance to it. Inside, it never exceeds the distance to the
+    wall, and equals it where the line bends less sharply than the lumen is wide. The lumen is open:
+    beyond the ends it continues straight. The arm must be inside it at X = 0 and may be outside
+    elsewhere at rest.
 
     **Arguments:**
-    - `radius`: $R$ [m], a number, or with a line a profile of the abscissa s along it.
+    - `radius`: $R$ [m], a number, or with a line a profile without jumps of the abscissa s along
+      it.
     - `line`: points of the centre line [m], shape (points, 3), in the axes of the pose. Two points
       are a straight line, more a cubic not-a-knot spline over the abscissa, which is the sum of the
       distances between the points. By default the x axis, endless.
@@ -71,19 +71,19 @@ class Tube(Obstacle):
             zero = jnp.zeros_like(local[0])
             return self.radius(zero, zero) - norm((local[1], local[2]))
         curve = curve_through(self.line, self.radius)
-        s = _nearest(lax.stop_gradient(curve), lax.stop_gradient(local))
+        s, stationary = _nearest(lax.stop_gradient(curve), lax.stop_gradient(local))
         # one step whose derivative is that of the nearest point: the distance, stationary in s,
         # then has exact derivatives up to the third
         rate, slope = _stationarity(curve, local, s)
-        return curve.depth(local, s - rate / lax.stop_gradient(slope))
+        step = rate / lax.stop_gradient(jnp.where(stationary, slope, -1.0))
+        return curve.depth(local, s - jnp.where(stationary, step, 0.0))
 
-    def check(self, name: str, rod: Rod, X: Float[Array, " stations"]) -> None:
-        widest = concrete(jnp.max(jax.vmap(rod.outline)(X)))
+    def check(self, name: str, outline: float) -> None:
         narrowest = concrete(jnp.min(self.radii))
-        if widest is not None and narrowest is not None and not narrowest > widest:
+        if narrowest is not None and not narrowest > outline:
             raise ValueError(
                 f"{name}.radius: got {narrowest:g} m at the narrowest place, need more than the "
-                f"{widest:g} m of the outline of the arm at the widest"
+                f"radius of the arm's outline, {outline:g} m"
             )
 
     @property
@@ -111,15 +111,17 @@ class Curve(NamedTuple):
 
     @property
     def samples(self) -> Float[Array, " samples"]:
-        """Abscissas [m] of samples, evenly between the points."""
+        """Abscissas [m] of samples, evenly between the points, and where the radius has kinks."""
         share = jnp.linspace(0.0, 1.0, _SAMPLES, endpoint=False, dtype=self.knots.dtype)
         inner = self.knots[:-1, None] + share * jnp.diff(self.knots)[:, None]
-        return jnp.append(inner.reshape(-1), self.knots[-1])
+        samples = jnp.append(inner.reshape(-1), self.knots[-1])
+        kinks = [jnp.clip(x, 0, self.knots[-1])[None] for x in self.radius.breakpoints]
+        return jnp.sort(jnp.concatenate([samples, *kinks])) if kinks else samples
 
     def position(self, s: Scalar) -> Position:
         """Point at an abscissa [m]; on the tangent at the nearest end beyond the ends."""
         inner = jnp.clip(s, self.knots[0], self.knots[-1])
-        tangent = jnp.where(s < inner, self.slopes[0], self.slopes[-1])
+        tangent = jnp.where(s < 0.5 * self.knots[-1], self.slopes[0], self.slopes[-1])
         return hermite_value(inner, self.knots, self.points, self.slopes) + (s - inner) * tangent
 
     def width(self, s: Scalar) -> Scalar:
@@ -151,15 +153,21 @@ def _stationarity(curve: Curve, point: Position, s: Scalar) -> tuple[Scalar, Sca
     return jax.jvp(scaled_rate, (s,), (jnp.ones_like(s),))
 
 
-def _nearest(curve: Curve, point: Position) -> Scalar:
-    """Abscissa of the deepest ball [m]: the best of the samples, improved by Newton steps that stay
-    between its neighbours."""
-    samples = curve.samples
-    best = jnp.argmax(jax.vmap(curve.depth, (None, 0))(point, samples))
-    beyond = 2 * (curve.knots[-1] + jnp.max(jnp.abs(point - curve.points)))
-    ends = jnp.concatenate([-beyond[None], samples, (curve.knots[-1] + beyond)[None]])
+def _nearest(curve: Curve, point: Position) -> tuple[Scalar, Bool[Array, ""]]:
+    """Abscissa of the deepest ball [m]: the best of the samples and of the two straight ends,
+    improved by Newton steps that stay between its neighbours; and whether the depth is stationary
+    there, which it is not where the radius has a kink."""
+    samples, length = curve.samples, curve.knots[-1]
+    first, last = (
+        jnp.sum((point - curve.points[i]) * curve.slopes[i]) / jnp.sum(curve.slopes[i] ** 2)
+        for i in (0, -1)
+    )
+    first, last = jnp.minimum(first, 0.0)[None], length + jnp.maximum(last, 0.0)[None]
+    tried = jnp.concatenate([first, samples, last])
+    best = jnp.argmax(jax.vmap(curve.depth, (None, 0))(point, tried))
+    ends = jnp.concatenate([first - length, tried, last + length])
 
-    def improve(_: int, bracket: tuple[Scalar, Scalar, Scalar]) -> tuple[Scalar, Scalar, Scalar]:
+    def improve(_: Array, bracket: tuple[Scalar, Scalar, Scalar]) -> tuple[Scalar, Scalar, Scalar]:
         low, s, high = bracket
         rate, slope = _stationarity(curve, point, s)
         low, high = jnp.where(rate > 0, s, low), jnp.where(rate > 0, high, s)
@@ -167,8 +175,15 @@ def _nearest(curve: Curve, point: Position) -> Scalar:
         sound = (slope < 0) & (newton >= low) & (newton <= high)
         return low, jnp.where(sound, newton, 0.5 * (low + high)), high
 
-    start = ends[best], samples[best], ends[best + 2]
-    return lax.fori_loop(0, _STEPS, improve, start)[1]
+    # two neighbours away: the nearest one may be the same place
+    start = ends[jnp.maximum(best - 1, 0)], tried[best], ends[jnp.minimum(best + 3, ends.size - 1)]
+    found = lax.fori_loop(0, _STEPS, improve, start)[1]
+    s = jnp.where(curve.depth(point, found) > curve.depth(point, start[1]), found, start[1])
+    rate, slope = _stationarity(curve, point, s)
+    depth = curve.depth(point, s)
+    rounding = 8 * jnp.finfo(s.dtype).eps * (length + jnp.abs(depth))
+    further = curve.depth(point, s - rate / jnp.where(slope < 0, slope, -1.0))
+    return s, (slope < 0) & (further >= depth - rounding)
 
 
 def _points(name: str, line: MatrixLike) -> Float[Array, "points 3"]:

@@ -25,12 +25,14 @@ from ..arm.actuator import Chamber, Tendon, Thread
 from ..arm.fields import arguments
 from ..arm.loads import DistributedWrench, Gravity, PointWrench, TipWrench
 from ..arm.material import Material
+from ..arm.obstacles import Box, Cylinder, Plane, Sphere
 from ..arm.pose_loads import MagneticDensity, MagneticMoment, Payload, Spinning, Spring
 from ..arm.profile import Constant, Piecewise, PolynomialProfile, SplineProfile, Taper
 from ..arm.rod import Rod
 from ..arm.routing import Helix, Linear, Parallel, Polynomial, Spline
 from ..arm.scene import Scene
 from ..arm.section import Annular, Circular, Elliptic, Joined, Rectangular
+from ..arm.tube import Tube
 from ..typing import PathLike, VectorLike
 from ..validation import concrete
 from .output import replacing
@@ -65,6 +67,7 @@ _GROUPS = {
         MagneticDensity,
         Spinning,
     ),
+    "obstacles": _group(Plane, Sphere, Cylinder, Box, Tube),
 }
 """Classes that are possible under a key; profiles under every other key."""
 

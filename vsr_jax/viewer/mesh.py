@@ -69,6 +69,17 @@ def discs(rims: Float[np.ndarray, "discs angles 3"]) -> Mesh:
     return Mesh(np.concatenate([rims.reshape(-1, 3), rims.mean(axis=1)]), triangles)
 
 
+def polygons(corners: Sequence[Float[np.ndarray, "_ 3"]]) -> Mesh:
+    """Convex polygons, each as triangles that share its first corner."""
+    first = np.cumsum([0, *(len(polygon) for polygon in corners)])
+    fans = [
+        start + np.stack([0 * (i := np.arange(1, len(polygon) - 1)), i, i + 1], axis=-1)
+        for start, polygon in zip(first, corners, strict=False)
+    ]
+    none = np.zeros((0, 3))
+    return Mesh(np.concatenate([none, *corners]), np.concatenate([none.astype(int), *fans]))
+
+
 def segments(
     threads: Float[np.ndarray, "threads stations 3"], slack: Bool[np.ndarray, " threads"]
 ) -> tuple[Float[np.ndarray, "segments 2 3"], Int[np.ndarray, " segments"]]:

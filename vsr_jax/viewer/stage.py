@@ -2,18 +2,22 @@
 
 from typing import Any
 
+import equinox as eqx
 import numpy as np
 from matplotlib.colors import to_rgb
 from matplotlib.typing import ColorType
 
 from ..arm.loads import Gravity
+from ..arm.obstacles import Obstacle
+from ..arm.scene import Scene
 from ..viz.annotate import Row
 from ..viz.body import Body
+from ..viz.obstacles import COLOR, opacity, polygons_of
 from ..viz.space import FRAME_COLORS
 from ..viz.style import COLORS, Theme, mixed, settings
 from .coloring import BANDS, COLORINGS, Scale
 from .description import Shape
-from .mesh import ArrowScale, Mesh, bands, discs, segments, tube, tube_values
+from .mesh import ArrowScale, Mesh, bands, discs, polygons, segments, tube, tube_values
 from .session import Answer
 
 _FRAME = 0.13
@@ -50,6 +54,7 @@ class Stage:
         self._nodes: dict[str, Any] = {}
         self._arrows = ArrowScale()
         self._factors: tuple[float, float] | None = None
+        self._obstacles: tuple[Obstacle, ...] = ()
         self.scale, self.drawn = Scale(COLORINGS["strain"]), 0
         self.theme("light")
 
@@ -87,6 +92,7 @@ class Stage:
                 self._draw_discs(body, good)
                 self._draw_threads(body, good)
                 self._draw_loads(shape, good)
+                self._draw_obstacles(shape.equilibrium.scene)
             self._server.flush()
         self.drawn += 1
 
@@ -131,6 +137,18 @@ class Stage:
         gravity = [x.acceleration for x in shape.equilibrium.scene.loads if isinstance(x, Gravity)]
         total = np.sum(np.asarray(gravity, float).reshape(-1, 3), axis=0)
         self._gravity(total)
+
+    def _draw_obstacles(self, scene: Scene) -> None:
+        """Draws the obstacles where the arm can be, and again where one changes."""
+        base = np.zeros(3) if scene.rod.base is None else np.asarray(scene.rod.base)[:3, 3]
+        around = base + 0.5 * self._length * np.stack([-np.ones(3), np.ones(3)])
+        for i, obstacle in enumerate(scene.obstacles):
+            known = self._obstacles[i] if self._obstacles else None
+            if not eqx.tree_equal(obstacle, known):
+                mesh = polygons(polygons_of(obstacle, around))
+                color = _bytes(COLOR)
+                self._mesh(f"/obstacles/{i}", mesh, color, opacity(obstacle), side="double")
+        self._obstacles = scene.obstacles
 
     def _frame(self) -> None:
         size = _FRAME * self._length

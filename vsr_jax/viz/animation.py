@@ -13,6 +13,7 @@ from ..solution.equilibrium import Equilibrium
 from ..solution.summary import Summary
 from ..typing import PathLike
 from .body import Body, body_of, draw_body
+from .obstacles import draw_obstacles
 from .space import equal_scale, fit_height, label_axes, new_space, world_frame
 from .style import COLORS, ink
 from .tendons import tension_bar, tension_scale
@@ -31,7 +32,7 @@ def film(
     dpi: int = 100,
 ) -> FuncAnimation:
     """Animation of a sequence of equilibria in one fixed box, with the path of the tip and one
-    scale of tensions.
+    scale of tensions, among the obstacles of the first scene.
 
     Where a solve failed, the last shape before it stays, dimmed, with the message of the status.
 
@@ -52,6 +53,8 @@ def film(
         raise ValueError(f"titles: got {len(titles)}, need {len(equilibria)}, one per equilibrium")
     writer = None if path is None else _writer(path, max(1, round(len(equilibria) / seconds)))
     bodies = _bodies(equilibria)
+    points = np.concatenate([body.points for body in bodies])
+    around = equilibria[0].scene.obstacles if isinstance(equilibria[0], Equilibrium) else ()
     tensions = [body.tension for body in bodies if body.tension is not None]
     scale = tension_scale(tensions)
     tips = np.array([body.samples.position[-1] for body in bodies])
@@ -63,12 +66,14 @@ def film(
             artist.remove()
         ax.plot(*tips[: i + 1].T, color=COLORS[3], linewidth=1.0, label="path of the tip")
         draw_body(ax, bodies[i], color=ink(0.5), scale=scale)
+        draw_obstacles(ax, around, points)
         world_frame(ax)
         failed = [] if bodies[i].failure is None else ["no equilibrium"]
         figure.suptitle(": ".join([*([] if titles is None else [titles[i]]), *failed]))
         return []
 
-    ax.auto_scale_xyz(*np.concatenate([body.points for body in bodies]).T)
+    ax.auto_scale_xyz(*points.T)
+    draw_obstacles(ax, around, points)
     label_axes(ax)
     equal_scale(ax, thinnest=0.2)
     fit_height(ax, _AREA)

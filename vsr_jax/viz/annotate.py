@@ -1,5 +1,5 @@
 """Annotations of an arm in 3D, drawn after `plot.arm`: frames of sections, arrows of loads,
-ellipsoids of the tip."""
+obstacles, ellipsoids of the tip."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -18,6 +18,8 @@ from ..arm.rod import Rod
 from ..arm.scene import Scene
 from ..solution.equilibrium import Equilibrium
 from ..validation import instance
+from .body import sample
+from .obstacles import draw_obstacles
 from .space import FRAME_COLORS, checked_space, equal_scale
 from .style import COLORS
 
@@ -86,6 +88,23 @@ def loads(
     equal_scale(ax)
     if legend and rows:
         ax.legend(loc="upper left")
+    return ax
+
+
+def obstacles(eq: Equilibrium, ax: Axes3D | None = None, *, stations: int = 60) -> Axes3D:
+    """The obstacles around an arm as translucent surfaces. Of endless ones the part near
+    the arm is drawn, as of a `Field`.
+
+    **Arguments:** `ax`: 3D axes, new ones by default; `stations`: number of stations of the arm.
+
+    **Returns:** the axes.
+
+    **Raises:** `ValueError` for an equilibrium that did not converge.
+    """
+    instance("eq", eq, Equilibrium, "an Equilibrium, before the axes")
+    ax = checked_space(ax)
+    draw_obstacles(ax, eq.scene.obstacles, np.asarray(sample(eq, stations).wall).reshape(-1, 3))
+    equal_scale(ax)
     return ax
 
 

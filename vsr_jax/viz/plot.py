@@ -18,6 +18,7 @@ from matplotlib.typing import ColorType, LineStyleType
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 
 from ..arm.loads import Gravity
+from ..arm.obstacles import Obstacle
 from ..arm.rod import STRAINS
 from ..solution.equilibrium import Equilibrium
 from ..solution.summary import Summary
@@ -25,6 +26,7 @@ from ..typing import VectorLike
 from ..validation import choice
 from . import annotate
 from .body import body_of, draw_body, sample
+from .obstacles import draw_obstacles, draw_outlines
 from .space import (
     THINNEST_BOX,
     checked_space,
@@ -89,9 +91,9 @@ def arm(
     at equal scale.
 
     With details, threads have the colour of their tension, with a colour bar (blue pushes,
-    vermilion pulls), and are dashed where they are slack; loads are arrows with a legend; the axes
-    of the world's frame and the direction of gravity are drawn. An arm too thin for its threads to
-    be told apart is drawn wider; the legend says by what factor.
+    vermilion pulls), and are dashed where they are slack; loads are arrows with a legend; obstacles
+    are translucent; the axes of the world's frame and the direction of gravity are drawn. An arm
+    too thin for its threads to be told apart is drawn wider; the legend says by what factor.
 
     Of a solve that failed, the arm at rest is drawn dimmed, with the message of the status.
 
@@ -118,6 +120,8 @@ def arm(
     draw_body(ax, body.widened(widening), surface=surface, threads=threads, **style)
     if details and isinstance(eq, Equilibrium) and body.failure is None:
         annotate.loads(eq, ax, legend=False)
+    if details and isinstance(eq, Equilibrium):
+        draw_obstacles(ax, eq.scene.obstacles, body.points)
     label_axes(ax)
     equal_scale(ax, thinnest=_THINNEST if own else THINNEST_BOX)
     if own:
@@ -226,6 +230,7 @@ def workspace(
     label: str = "",
     color: ColorType = COLORS[0],
     most: int = 20_000,
+    obstacles: Sequence[Obstacle] = (),
 ) -> np.ndarray:
     """The workspace of the tip: its positions in 3D, and projected along each axis.
 
@@ -237,6 +242,7 @@ def workspace(
       points.
     - `color`: of the points in space without `values`.
     - `most`: maximum number of points drawn; larger sets are subsampled evenly.
+    - `obstacles`: drawn in space, and as areas in the projections.
 
     **Returns:** the axes: 3D, then y over x, z over x, z over y.
 
@@ -253,11 +259,13 @@ def workspace(
     style: dict[str, Any] = {"s": 3, "linewidths": 0, "rasterized": True}
     style |= {"c": color} if values is None else {"c": np.asarray(values)[shown]}
     points = axes[0].scatter(*positions[shown].T, alpha=0.5, **style)
+    draw_obstacles(axes[0], obstacles, positions[finite])
     label_axes(axes[0])
     equal_scale(axes[0])
     if ax is None:
         fill(axes[0], _CLOUD)
     for panel, (i, j) in zip(axes[1:], _PAIRS, strict=True):
+        draw_outlines(panel, obstacles, positions[finite], (i, j))
         if values is not None:
             panel.scatter(positions[shown, i], positions[shown, j], **style)
         panel.set(xlabel=f"{'xyz'[i]} [m]", ylabel=f"{'xyz'[j]} [m]")

@@ -15,7 +15,7 @@ from ..models.base import Model
 from ..optimization.design_search import Design
 from ..optimization.objective import CurveError, Objective, TipError
 from ..solution.solver import solve
-from . import plot
+from . import annotate, plot
 from .space import checked_space, equal_scale, fit_height
 from .style import COLORS, ink
 
@@ -78,6 +78,8 @@ def before_after(
             label = None if i else name
             style: dict[str, Any] = {"color": color, "label": label, "linestyle": line}
             plot.arm(eq, ax, stations=40, **style)
+    if after and bool(after[0].converged):
+        annotate.obstacles(after[0], ax)
     points = np.asarray(_targets(targets) if isinstance(targets, Objective) else targets)
     if targets is not None and points.size:
         cross: dict[str, Any] = {"color": ink(), "marker": "x", "s": 28, "linewidths": 1.6}
