@@ -218,5 +218,15 @@ def _solve(
     shares = 1 if whole.loads is None else LOAD_INCREMENTS
     floor = jnp.broadcast_to(rounding_of(whole), arms)
     again = None if guess is None else origin
-    measures = Measures(sizes.work, sizes.turn, sizes.dot if whole.follows_rate or whole.softens else None)
-    return damped_newton(evaluate, measures, start, floor, shares, again, stages=HARDENING_STAGES if whole.softens else 0)
+    measures = Measures(
+        sizes.work, sizes.turn, sizes.dot if whole.follows_rate or whole.softens else None
+    )
+    return damped_newton(
+        evaluate,
+        measures,
+        start,
+        floor,
+        shares,
+        again,
+        stages=HARDENING_STAGES if whole.softens else 0,
+    )

@@ -43,9 +43,9 @@ _BLUR = 1e-9
 _TOGETHER = 24
 """Contacts whose forces are solved for together in one step of Newton's method, at most."""
 
-_FLATNESS, _FLATTER = 1e-3, 0.5
-"""How far the nearest point of a step may be from the least gap, as a fraction of the outline, and
-of the width of penalties."""
+_FLATNESS, _FLATTER = 0.5, 0.5
+"""How far the nearest point of a step may be from the least gap, as a fraction of the outline over
+the square of the number of steps, and of the width of penalties."""
 
 
 class Contacts(Coupling):
@@ -191,7 +191,7 @@ def contacts_of(scene: Scene, sections: CrossSections, grid: Grid) -> Contacts |
     base = jnp.asarray(base_pose(scene.rod.base, grid.h.dtype))[:3, 3]
     length = jnp.sum(grid.h)
     bending = jnp.sum(grid.weight * softest(sections.stiffness)) / length
-    flatness = _FLATNESS * scene.rod.outline(0.5 * scene.rod.length)
+    flatness = _FLATNESS * scene.rod.outline(0.5 * scene.rod.length) / grid.h.shape[0] ** 2
     return Contacts(
         scene.obstacles,
         scene.rod,

@@ -6,7 +6,7 @@ of the grid and for each obstacle the nearest point of the axis is found,
 $$\sigma = \arg\min_s \, d(r(s)) - \rho(s) + \epsilon (2 s - 1)^2, \quad 0 \le s \le 1,$$
 
 with the distance d to the obstacle and the polynomial r(s) through the step. The small $\epsilon$
-makes it unique where the arm lies along a surface. The gap there is $g = d(r) - \rho$, and without
+makes it unique where the arm lies along a surface, and is smaller still where it does not. The gap there is $g = d(r) - \rho$, and without
 friction the contact force is $\lambda n$ with $n = \nabla d$.
 
 The position r(s) is an integral of the axis with weights $a_j(s)$ for the nodes of the step. A force
@@ -142,8 +142,12 @@ def _nearest(
     def gap(s: Array) -> Array:
         return obstacle.distance(place(s)) - rod.outline(X + s * h)
 
+    # less where the gap has a clear minimum
+    curved = 4 * (gap(jnp.zeros_like(h)) + gap(jnp.ones_like(h)) - 2 * gap(0.5 * jnp.ones_like(h)))
+    flat = flatness * 8 * flatness / (8 * flatness + jnp.maximum(curved, 0.0))
+
     def lifted(s: Array) -> Array:
-        return gap(s) + flatness * (2 * s - 1) ** 2
+        return gap(s) + flat * (2 * s - 1) ** 2
 
     slope_at, curvature_at = jax.grad(lifted), jax.grad(jax.grad(lifted))
     samples = jnp.linspace(0.0, 1.0, _SAMPLES, dtype=h.dtype)
