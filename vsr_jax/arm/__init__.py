@@ -5,6 +5,7 @@ Data and their geometry only. Must not know how an equilibrium is found or how a
 """
 
 from .actuator import Actuator, Chamber, Tendon, Thread
+from .held import Held
 from .loads import DistributedWrench, Frame, Gravity, Load, PointWrench, TipWrench
 from .material import Material
 from .obstacles import Box, Cylinder, Field, Obstacle, Plane, Sphere
@@ -50,6 +51,7 @@ __all__ = [
     "Function",
     "FunctionProfile",
     "Gravity",
+    "Held",
     "Helix",
     "Joined",
     "Linear",

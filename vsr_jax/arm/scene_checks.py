@@ -97,8 +97,8 @@ def check_held(rod: Rod, held: Sequence[Held]) -> None:
             )
         if X in places[:i]:
             raise ValueError(
-                f"Scene.held[{i}].X: got {X:g} m, where Scene.held[{places.index(X)}] holds the arm "
-                f"already; need one Held per section"
+                f"Scene.held[{i}].X: got {X:g} m, where Scene.held[{places.index(X)}] holds the "
+                f"arm already; need one Held per section"
             )
 
 

@@ -23,6 +23,7 @@ from jaxtyping import Array, Float
 
 from ..arm.actuator import Chamber, Tendon, Thread
 from ..arm.fields import arguments
+from ..arm.held import Held
 from ..arm.loads import DistributedWrench, Gravity, PointWrench, TipWrench
 from ..arm.material import Material
 from ..arm.obstacles import Box, Cylinder, Plane, Sphere
@@ -67,6 +68,7 @@ _GROUPS = {
         MagneticDensity,
         Spinning,
     ),
+    "held": _group(Held),
     "obstacles": _group(Plane, Sphere, Cylinder, Box, Tube),
 }
 """Classes that are possible under a key; profiles under every other key."""

@@ -6,13 +6,15 @@ gap g to the obstacle is least (see `touch`). The rows are the complementarity o
 $$\min(\lambda, k g) = 0,$$
 
 so that forces only push, gaps are not negative and one of the two is zero; the stiffness k only
-scales gaps to forces. With the contacts that push given, Newton's method solves for their forces and
-the shape together; which contacts push is found with them (a semismooth Newton method, or active
-set).
+scales gaps to forces. The minimum is smoothed,
+
+$$\tfrac12 (\lambda + k g - \sqrt{(\lambda - k g)^2 + 4 (k b)^2}) = 0, \quad \lambda g = k b^2,$$
+
+in the end over a length b of 1e-9 of the arm. Newton's method solves for forces and shape together.
 
 On the way to a solution that this does not find at once, penalties stand for the forces, $\lambda =
-k_p \max(0, -g)$: the balance is then the gradient of an energy, which shows whether a step is an
-advance.
+\tfrac12 k_p (\sqrt{g^2 + w^2} - g)$: the balance is then the gradient of an energy, which shows
+whether a step is an advance. The width w becomes smaller; then b does, from 1e-2 of the arm.
 """
 
 from dataclasses import replace
@@ -34,11 +36,11 @@ from .sizes import softest
 from .touch import Surroundings, Touch
 
 _PENALTY, _WIDTH, _SHARPER = 100.0, 0.02, 1e-3
-"""Stiffness of the penalties that stand for contact forces, in multiples of k; the gap at which they
-begin to act, as a fraction of the arm's length, and by what it becomes smaller as they harden."""
+"""Stiffness $k_p$ of penalties, in multiples of k; their width w, as a fraction of the arm's
+length, and by what it becomes smaller as they harden."""
 
 _BLUR = 1e-9
-"""Product of gap and scaled force at the end, as its root and a fraction of the arm's length."""
+"""Length b, as a fraction of the arm's."""
 
 _TOGETHER = 24
 """Contacts whose forces are solved for together in one step of Newton's method, at most."""
@@ -52,7 +54,8 @@ class Contacts(Coupling):
     """All contacts of an arm; the unknowns are their forces [N], shape (obstacles * steps, ...).
 
     **Fields:** the `obstacles`, the `rod` and the position of its `base`; the stiffness k, `scale`;
-    `flatness` and `lift` of `Surroundings`; `soft`: 1 where penalties stand for the forces.
+    `flatness` and `lift` of `Surroundings`; the lengths b, `blur`, and w, `width`; `soft`: 1 where
+    penalties stand for the forces; the number of `steps`.
     """
 
     obstacles: tuple[Obstacle, ...]
@@ -98,8 +101,9 @@ class Contacts(Coupling):
 
     def note(self, x: Array, at: ArmState, problem: ArmProblem) -> Touch:
         """The contacts, with one axis for obstacles and steps."""
-        assert at.along is not None and at.along.touch is not None
+        assert at.along is not None
         touch, ends = at.along.touch, x.ndim + 1
+        assert touch is not None
 
         def flat(a: Array) -> Array:
             front = a.shape[: a.ndim - ends]

@@ -6,11 +6,11 @@ of the grid and for each obstacle the nearest point of the axis is found,
 $$\sigma = \arg\min_s \, d(r(s)) - \rho(s) + \epsilon (2 s - 1)^2, \quad 0 \le s \le 1,$$
 
 with the distance d to the obstacle and the polynomial r(s) through the step. The small $\epsilon$
-makes it unique where the arm lies along a surface, and is smaller still where it does not. The gap there is $g = d(r) - \rho$, and without
-friction the contact force is $\lambda n$ with $n = \nabla d$.
+makes it unique where the arm lies along a surface, and is smaller still where it does not. The gap
+there is $g = d(r) - \rho$. Without friction the contact force is $\lambda n$ with $n = \nabla d$.
 
-The position r(s) is an integral of the axis with weights $a_j(s)$ for the nodes of the step. A force
-at s acts on node j with the share $a_j(s) / a_j(1)$, so that its work is that of the discrete
+The position r(s) is an integral of the axis with weights $a_j(s)$ for the nodes of the step. A
+force at s acts on node j with the share $a_j(s) / a_j(1)$, so that its work is that of the discrete
 positions: the balance with contact forces is the gradient of a discrete energy.
 """
 
@@ -32,11 +32,12 @@ _SAMPLES, _ITERATIONS = 5, 6
 
 
 class Surroundings(NamedTuple):
-    """The obstacles around an arm.
+    r"""The obstacles around an arm.
 
-    **Fields:** the `obstacles`, the `rod` and the position of its `base`; `flatness` $\\epsilon$
-    [m]; `lift` [m], added to all gaps; `force` [N] of each obstacle on each step, shape (obstacles *
-    steps, ...); `soft`: None, or 1 where penalties of `stiffness` [N/m] stand for the forces.
+    **Fields:** the `obstacles`, the `rod` and the position of its `base`; `flatness` $\epsilon$
+    [m]; `lift` [m], added to all gaps; `force` [N] of each obstacle on each step, shape (obstacles
+    * steps, ...); `soft`: None, or 1 where penalties of a `stiffness` [N/m] and `width` [m] stand
+    for the forces.
     """
 
     obstacles: tuple[Obstacle, ...]

@@ -1,5 +1,5 @@
-"""What holds an arm and what it touches: support reactions, contacts, and the tangent of an arm that
-they constrain."""
+"""What holds an arm and what it touches: support reactions, contacts, and the tangent of an arm
+that they constrain."""
 
 from typing import NamedTuple
 
@@ -10,20 +10,20 @@ from jaxtyping import Array, Float
 
 from ..mechanics.arm_balance import ArmUnknown, imbalance_of, state_of
 from ..mechanics.balance import free_components, spread
-from ..mechanics.contact import Contacts
 from ..mechanics.coupling import ArmProblem
 from ..mechanics.held import Holds
 from ..numerics import lu
 from ..numerics.component import Vector
 from ..numerics.lanczos import Operator
+from ..typing import DTypeLike
 
 
 class Contact(NamedTuple):
     """Contact of each obstacle with each step along the arm, where the gap is least.
 
-    **Fields**, the obstacles in the first axis and the steps in the second: abscissa `X` [m];
-    `position` [m] of the axis in the world; `normal` of the obstacle; `gap` [m] between the outline
-    and the obstacle; `force` [N] along the normal, at most rounding where they do not touch.
+    **Fields:** with the obstacles in the first axis and the steps in the second, the abscissa `X`
+    [m]; `position` [m] of the axis in the world; `normal` of the obstacle; `gap` [m] between the
+    outline and the obstacle; `force` [N] along the normal, nearly 0 where they do not touch.
     """
 
     X: Float[Array, "obstacles steps"]
@@ -33,24 +33,24 @@ class Contact(NamedTuple):
     force: Float[Array, "obstacles steps"]
 
 
+def no_contact(dtype: DTypeLike) -> Contact:
+    """That of an arm without obstacles."""
+    none, vectors = jnp.zeros((0, 0), dtype), jnp.zeros((0, 0, 3), dtype)
+    return Contact(none, vectors, vectors, none, none)
+
+
 def supports_of(problem: ArmProblem, unknown: ArmUnknown) -> Float[Array, "supports 6"]:
     """Moment and force in the world frame by which each held section is held."""
-    for coupling, x in zip(problem.couplings, unknown.coupled, strict=True):
-        if isinstance(coupling, Holds):
-            return coupling.wrenches(x)
-    return jnp.zeros((0, 6), unknown.xi[0].dtype)
+    found = zip(problem.couplings, unknown.coupled, strict=True)
+    return jnp.concatenate([one.wrenches(x) for one, x in found if isinstance(one, Holds)])
 
 
 def contacts_of(problem: ArmProblem, unknown: ArmUnknown) -> Contact:
-    """The contacts of an arm."""
-    touch = None
-    at = state_of(unknown.xi, unknown.coupled, problem)
-    touch = None if at.along is None else at.along.touch
-    grid = problem.grid
-    if touch is None:
-        none = jnp.zeros((0, grid.h.size), grid.h.dtype)
-        vectors = jnp.zeros((0, grid.h.size, 3), grid.h.dtype)
-        return Contact(none, vectors, vectors, none, none)
+    """The contacts of an arm with obstacles."""
+    along, grid = state_of(unknown.xi, unknown.coupled, problem).along, problem.grid
+    assert along is not None
+    touch = along.touch
+    assert touch is not None
     return Contact(
         grid.start + touch.sigma * grid.h,
         jnp.moveaxis(touch.place, 0, -1),

@@ -19,7 +19,7 @@ from ..numerics import component as c
 from ..numerics.component import Vector
 from ..typing import Pose, Scalar, VectorLike
 from ..validation import is_traced, on_arm
-from .bearing import Contact, contacts_of, supported, supports_of
+from .bearing import Contact, contacts_of, no_contact, supported, supports_of
 from .energy import Energy, energy_of
 from .estimate import Error, error_of
 from .quantities import (
@@ -150,11 +150,15 @@ class Equilibrium(Solved):
     def supports(self) -> Float[Array, "supports 6"]:
         """Support reactions: the moment [N m] and force [N] in the world frame by which each held
         section is held."""
+        if not self.scene.held:
+            return jnp.zeros((0, 6), self.inputs.dtype)
         return supports_of(*self._balance)
 
     @structure("m and N")
     def contacts(self) -> Contact:
         """Contacts with the obstacles: where, gap [m] and force [N]."""
+        if not self.scene.obstacles:
+            return no_contact(self.inputs.dtype)
         return contacts_of(*self._balance)
 
     @structure("m, and as the strain")

@@ -1,0 +1,211 @@
+"""Held sections and contact against closed forms, free bodies and finite differences."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+from scipy.special import ellipe, ellipk
+
+import vsr_jax as vsr
+from vsr_jax.arm.rod import STRAINS
+from vsr_jax.files.scene_file import parse_scene, to_toml
+
+L = 0.2
+NO_INPUTS = jnp.zeros(0)
+MODEL = vsr.StrainDependent(12)
+BENDING = ("bending_y", "bending_z")
+
+
+def rod(radius=0.005, young=1e6, density=1000.0):
+    material = vsr.Material(young=young, poisson=0.3, density=density)
+    return vsr.Rod(length=L, section=vsr.Circular(radius=radius), material=material)
+
+
+def stiffness(radius=0.005, young=1e6):
+    return young * np.pi * radius**4 / 4
+
+
+def solved(*loads, model=MODEL, start=None, free_strains=STRAINS, arm=None, **around):
+    scene = vsr.Scene(arm or rod(), (), loads, free_strains=free_strains, **around)
+    return vsr.solve(scene, NO_INPUTS, model=model, start=start)
+
+
+def test_a_propped_cantilever_is_held_by_three_eighths_of_its_load():
+    q = 1e-4
+    prop = vsr.Held(position=(L, 0, 0), along=(1, 0, 0))
+    eq = solved(vsr.DistributedWrench(force=(0, 0, -q)), held=prop, free_strains=BENDING)
+    np.testing.assert_allclose(eq.supports[0], [0, 0, 0, 0, 0, 3 / 8 * q * L], atol=1e-6 * q * L)
+    np.testing.assert_allclose(eq.tip[2, 3], 0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("orientation", "load"),
+    [(np.eye(3), 4 * np.pi**2), (None, 20.190728556426629)],
+    ids=["clamped", "pinned"],
+)
+def test_the_margin_of_a_held_column_vanishes_at_its_buckling_load(orientation, load):
+    """The pinned end: tan x = x at x^2 = 20.19."""
+    force = 0.5 * load * stiffness() / L**2
+    end = vsr.Held(position=(L, 0, 0), orientation=orientation, along=(1, 0, 0))
+    eq = solved(
+        vsr.TipWrench(force=(-force, 0, 0)),
+        held=end,
+        free_strains=BENDING,
+        model=vsr.StrainDependent(24),
+    )
+    np.testing.assert_allclose(eq.stability, 0.5, atol=1e-7)
+
+
+def test_a_clamped_elastica_has_the_force_of_the_elliptic_integrals():
+    """Both ends clamped, brought to 0.8 L: four quarter waves, 2 E / K - 1 = 0.8 and
+    P = (4 K)^2 EI / L^2."""
+    m = brentq(lambda m: 2 * ellipe(m) / ellipk(m) - 1.8, 1e-6, 0.9)
+    force = (4 * ellipk(m)) ** 2 * stiffness() / L**2
+    end = vsr.Held(position=(0.8 * L, 0, 0), orientation=np.eye(3))
+    aside = vsr.PointWrench(L / 2, force=(0, 0, 0.05 * force))
+    more = {"held": end, "free_strains": BENDING, "model": vsr.StrainDependent(24)}
+    bent = solved(aside, **more)
+    eq = solved(start=bent, **more)
+    np.testing.assert_allclose(eq.supports[0, 3], -force, rtol=1e-6)
+    assert float(eq.position(L / 2)[2]) > 0.2 * L
+
+
+def test_held_sections_have_exact_derivatives():
+    def height(shortened, mode):
+        end = vsr.Held(position=jnp.array([1.0, 0, 0]) * L * (1 - shortened))
+        scene = vsr.Scene(rod(), (), [vsr.TipWrench(moment=(0, 0.01, 0))], held=end)
+        return vsr.solve(scene, NO_INPUTS, model=MODEL).position(L / 2)[2]
+
+    h, at = 1e-5, 0.1
+    difference = (height(at + h, 0) - height(at - h, 0)) / (2 * h)
+    np.testing.assert_allclose(jax.grad(height)(at, 0), difference, rtol=1e-6)
+    forward = jax.jvp(lambda x: height(x, 0), (at,), (1.0,))[1]
+    np.testing.assert_allclose(forward, difference, rtol=1e-6)
+
+
+SPHERE = vsr.Sphere((0.1, 0.012, -0.03), 0.02)
+PRESS = vsr.TipWrench(force=(0, 0.005, -0.03))
+
+
+@pytest.fixture(scope="module")
+def pressed():
+    return solved(PRESS, obstacles=SPHERE)
+
+
+def test_contact_pushes_only_where_the_gap_is_closed(pressed):
+    contacts = pressed.contacts
+    assert float(contacts.force.max()) > 0.02
+    assert float(contacts.gap.min()) > -1e-9
+    scale = 3 * stiffness() / L**2
+    smaller = jnp.minimum(jnp.abs(contacts.gap) / L, jnp.abs(contacts.force) / scale)
+    assert float(smaller.max()) < 1e-8
+    X = jnp.linspace(0, L, 801)
+    gap = jax.vmap(SPHERE.distance)(pressed.position(X)) - 0.005
+    assert float(gap.min()) > -1e-3 * 0.005
+
+
+def test_a_touching_arm_is_the_free_arm_under_its_contact_force(pressed):
+    """The same arm without obstacle, loaded by the contact force: other code, with the force at a
+    breakpoint."""
+    contacts = pressed.contacts
+    at = int(jnp.argmax(contacts.force[0]))
+    force = contacts.force[0, at] * contacts.normal[0, at]
+    free = solved(
+        PRESS, vsr.PointWrench(contacts.X[0, at], force=force), model=vsr.StrainDependent(48)
+    )
+    np.testing.assert_allclose(pressed.tip[:3, 3], free.tip[:3, 3], atol=2e-5 * L)
+    whole = force + jnp.array([0, 0.005, -0.03])
+    base = pressed.pose(0.0)[:3, :3] @ pressed.reaction(0.0)[3:]
+    np.testing.assert_allclose(base, whole, atol=1e-12)
+
+
+def test_contact_has_exact_derivatives_and_batches(pressed):
+    def height(radius, force):
+        obstacle = vsr.Sphere((0.1, 0.012, -0.03), radius)
+        load = vsr.TipWrench(force=jnp.stack([0 * force, 0.005 + 0 * force, -force]))
+        return solved(load, obstacles=obstacle).tip[2, 3]
+
+    at, h = (0.02, 0.03), 1e-6
+    gradient = jax.grad(height, (0, 1))(*at)
+    for i in range(2):
+        up, down = (tuple(x + s * h * (i == j) for j, x in enumerate(at)) for s in (1, -1))
+        difference = (height(*up) - height(*down)) / (2 * h)
+        np.testing.assert_allclose(gradient[i], difference, rtol=1e-6)
+    tangent = jax.jvp(height, at, (1.0, 0.0))[1]
+    np.testing.assert_allclose(tangent, gradient[0], rtol=1e-8)
+    many = jax.vmap(lambda force: height(0.02, force))(jnp.array([0.0, 0.01, 0.03]))
+    np.testing.assert_allclose(many[2], pressed.tip[2, 3], atol=1e-10)
+    np.testing.assert_allclose(many[1], height(0.02, 0.01), atol=1e-10)
+
+
+def test_a_heavy_arm_lies_on_the_floor():
+    """Far from the lift-off the floor carries the weight of each step."""
+    floor = vsr.Plane((0, 0, 1), (0, 0, -0.02))
+    g = 30.0
+    eq = solved(
+        vsr.Gravity(acceleration=(0, 0, -g)), obstacles=floor, model=vsr.StrainDependent(24)
+    )
+    contacts = eq.contacts
+    of_step = 1000.0 * np.pi * 0.005**2 * g * L / 24
+    np.testing.assert_allclose(contacts.force[0, 18:21], of_step, rtol=1e-2)
+    np.testing.assert_allclose(eq.tip[2, 3], -0.015, atol=1e-3 * 0.005)
+    assert int(jnp.sum(contacts.force[0] > 1e-2 * of_step)) in range(9, 12)
+
+
+def test_single_precision(pressed):
+    scene = pressed.scene.astype(jnp.float32)
+    eq = vsr.solve(scene, NO_INPUTS.astype(jnp.float32), model=MODEL)
+    assert eq.tip.dtype == jnp.float32
+    np.testing.assert_allclose(eq.tip, pressed.tip, atol=2e-4)
+
+
+def test_scene_files_keep_held_sections(pressed):
+    end = vsr.Held(0.1, position=(0.1, 0, 0.01), along=(0, 1, 0))
+    scene = vsr.Scene(rod(), held=end, obstacles=SPHERE)
+    again = parse_scene(to_toml(scene)).scene
+    assert "held section" in scene.effects
+    for x, y in zip(jax.tree.leaves(scene), jax.tree.leaves(again), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def test_scenes_without_obstacles_have_no_contacts():
+    eq = solved(PRESS)
+    assert eq.contacts.force.shape == (0, 0)
+    assert eq.supports.shape == (0, 6)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: vsr.Held(0.1), "Held: got neither a position nor an orientation"),
+        (lambda: vsr.Held(0.1, orientation=2 * np.eye(3)), "Held.orientation: got columns"),
+        (lambda: vsr.Held(position=(0, 0, 0), along=(0, 0, 0)), "Held.along: got (0, 0, 0)"),
+        (lambda: vsr.Held(orientation=np.eye(3), along=(1, 0, 0)), "Held.along: got a direction"),
+        (
+            lambda: vsr.Scene(rod(), held=vsr.Held(0.3, position=(0, 0, 0))),
+            "Scene.held[0].X: got 0.3 m, need a place on the arm of 0.2 m",
+        ),
+        (
+            lambda: vsr.Scene(rod(), held=[vsr.Held(0.1, position=(0.1, 0, z)) for z in (0, 0.1)]),
+            "Scene.held[1].X: got 0.1 m, where Scene.held[0] holds the arm already",
+        ),
+        (
+            lambda: solved(PRESS, obstacles=SPHERE, model=vsr.Continuum()),
+            "model: got Continuum for a scene with obstacles, need StrainDependent",
+        ),
+        (
+            lambda: solved(
+                PRESS,
+                held=vsr.Held(position=(0.2, 0, 0)),
+                model=vsr.Prescribed(vsr.Legendre(2)),
+            ),
+            "model: got Prescribed for a scene with held sections, need StrainDependent",
+        ),
+    ],
+)
+def test_errors_say_what_is_needed(make, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        make()
