@@ -200,7 +200,7 @@ def test_scenes_without_obstacles_have_no_contacts():
             lambda: solved(
                 PRESS,
                 held=vsr.Held(position=(0.2, 0, 0)),
-                model=vsr.Prescribed(vsr.Legendre(2)),
+                model=vsr.Prescribed(vsr.Basis.uniform(vsr.Legendre(2))),
             ),
             "model: got Prescribed for a scene with held sections, need StrainDependent",
         ),

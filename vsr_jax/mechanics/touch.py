@@ -154,7 +154,7 @@ def _nearest(
     samples = jnp.linspace(0.0, 1.0, _SAMPLES, dtype=h.dtype)
     first = samples[jnp.argmin(jax.vmap(lifted)(samples))]
 
-    def closer(_: int, s: Array) -> Array:
+    def closer(_: Array, s: Array) -> Array:
         slope, curvature = slope_at(s), curvature_at(s)
         step = jnp.where(curvature > 0, slope / curvature, jnp.sign(slope))
         return jnp.clip(s - jnp.clip(step, -0.25, 0.25), 0.0, 1.0)
