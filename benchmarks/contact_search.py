@@ -13,6 +13,7 @@ import argparse
 import json
 import time
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +26,7 @@ jax.config.update("jax_enable_x64", True)
 LENGTH, RADIUS, YOUNG, STEPS, BATCH = 0.2, 0.005, 2e5, 24, 50
 
 
-def drawn(rng: np.random.Generator, count: int) -> dict[str, np.ndarray]:
+def drawn(rng: np.random.Generator, count: int) -> dict[str, Any]:
     """Numbers of one arm: density, force, centres and radii of spheres beside the straight arm."""
     centres, radii = [], []
     while len(radii) < count:

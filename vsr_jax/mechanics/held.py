@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..arm.held import Held
-from ..arm.pose_loads import PoseLoad
+from ..arm.pose_loads import Needs, PoseLoad
 from ..arm.rod import Rod
 from ..arm.scene import CrossSections, Scene
 from ..numerics.component import Forces, Vector
@@ -229,11 +229,14 @@ class HoldingMoment(PoseLoad):
 
     moment: Array
     orientation: Array
-    needs = "rotation"
     effect = "moment of a held section"
 
     def __init__(self, moment: Array, orientation: Array):
         self.moment, self.orientation, self.frame = moment, orientation, "world"
+
+    @property
+    def needs(self) -> Needs:
+        return "rotation"
 
     def potential(self, rod: Rod, X: Scalar, rotation: Array, position: Array) -> Scalar:
         off = rotation_vector(matmul(rotation, transpose(self.orientation)))
