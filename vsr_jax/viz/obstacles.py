@@ -110,8 +110,8 @@ def _surface(obstacle: Obstacle, region: Region) -> Polygons:
         across = [i for i in range(3) if i != axis]
         cells = np.argwhere(crossed)
         cells = cells[np.all((cells[:, across] > 0) & (cells < number - 1)[:, across], axis=1)]
-        corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) @ np.eye(3, dtype=int)[across]
-        quads.append(cells[:, None] - corners)
+        around = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) @ np.eye(3, dtype=int)[across]
+        quads.append(cells[:, None] - around)
     middles = jnp.asarray(low + step * (np.concatenate(quads).reshape(-1, 3) + 0.5))
     corners = _projected(obstacle, middles, jnp.asarray(step))
     return list(np.asarray(corners, float).reshape(-1, 4, 3))
