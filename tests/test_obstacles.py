@@ -336,6 +336,8 @@ def test_derivatives_by_the_numbers_of_a_scene(name, place):
     assert abs(expected) > 1e-2
     np.testing.assert_allclose(jax.grad(gap)(x), expected, rtol=1e-6)
     np.testing.assert_allclose(jax.jvp(gap, (x,), (jnp.ones_like(x),))[1], expected, rtol=1e-6)
+    several = x * jnp.array([0.9, 1.0, 1.1])
+    np.testing.assert_allclose(jax.vmap(gap)(several), [gap(y) for y in several], rtol=1e-12)
 
 
 def test_replaced_numbers_are_checked():
@@ -455,7 +457,9 @@ def test_a_large_obstacle_is_drawn_near_the_points():
     assert np.max(np.abs(corners)) < 0.3
     np.testing.assert_allclose(corners[:, 2], -0.1, atol=2e-3)
     far = vsr.Sphere((0.0, 0.0, -50.0), 49.0)
-    assert polygons_of(far, np.array([[-0.1, 0.0, 0.0], [0.1, 0.0, 0.1]])) == []
+    field = vsr.Field(Ellipsoid(jnp.full(3, 0.1), jnp.array([0.0, 0.0, 5.0])))
+    for obstacle in (far, field):
+        assert polygons_of(obstacle, np.array([[-0.1, 0.0, 0.0], [0.1, 0.0, 0.1]])) == []
 
 
 def test_triangles_of_polygons_have_their_area():

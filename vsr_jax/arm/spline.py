@@ -35,12 +35,7 @@ def spline_value(X: Scalar, points: Points, values: Points) -> Scalar:
     Two points give the straight line and three the parabola through them. The first and the last
     piece extend beyond the end points.
     """
-    return hermite_value(X, points, values, spline_slopes(points, values))
-
-
-def hermite_value(X: Scalar, points: Points, values: Array, slopes: Array) -> Array:
-    """Value at X [m] of the cubic pieces with given values and derivatives at the abscissas
-    `points` [m]; of shape (points,), or (points, components) for a curve."""
+    slopes = spline_slopes(points, values)
     i = jnp.clip(jnp.searchsorted(points, X, side="right") - 1, 0, points.size - 2)
     h = points[i + 1] - points[i]
     s = (X - points[i]) / h

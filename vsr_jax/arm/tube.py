@@ -15,7 +15,7 @@ from ..validation import concrete, numbers, rigid
 from .functions import Position
 from .obstacles import Obstacle, local_point
 from .profile import Constant, Profile, ProfileLike, as_profile
-from .spline import hermite_value, spline_slopes
+from .spline import spline_slopes
 
 _SAMPLES = 8
 """Samples of the centre line per point, from the best of which Newton's method starts."""
@@ -101,12 +101,12 @@ class Tube(Obstacle):
 
 
 class Curve(NamedTuple):
-    """A centre line: the abscissas [m] of its points, the points, the derivatives of the spline
-    there, and the radius along it."""
+    """A centre line: the abscissas [m] of its points; the start of each piece [m] and its
+    coefficients in ascending order, the straight ends included; and the radius along it."""
 
     knots: Float[Array, " points"]
-    points: Float[Array, "points 3"]
-    slopes: Float[Array, "points 3"]
+    starts: Float[Array, " pieces"]
+    coefficients: Float[Array, "pieces 4 3"]
     radius: Profile
 
     @property
@@ -118,11 +118,11 @@ class Curve(NamedTuple):
         kinks = [jnp.clip(x, 0, self.knots[-1])[None] for x in self.radius.breakpoints]
         return jnp.sort(jnp.concatenate([samples, *kinks])) if kinks else samples
 
-    def position(self, s: Scalar) -> Position:
-        """Point at an abscissa [m]; on the tangent at the nearest end beyond the ends."""
-        inner = jnp.clip(s, self.knots[0], self.knots[-1])
-        tangent = jnp.where(s < 0.5 * self.knots[-1], self.slopes[0], self.slopes[-1])
-        return hermite_value(inner, self.knots, self.points, self.slopes) + (s - inner) * tangent
+    def at(self, s: Scalar) -> tuple[Position, Array, Array]:
+        """Point at an abscissa [m], and its first two derivatives."""
+        i = jnp.sum(s >= self.knots)
+        t, (a, b, c, d) = s - self.starts[i], self.coefficients[i]
+        return a + t * (b + t * (c + t * d)), b + t * (2 * c + 3 * t * d), 2 * c + 6 * t * d
 
     def width(self, s: Scalar) -> Scalar:
         """Radius [m] at an abscissa [m]; that of the nearest end beyond the ends."""
@@ -130,27 +130,38 @@ class Curve(NamedTuple):
 
     def depth(self, point: Position, s: Scalar) -> Scalar:
         """Depth [m] of a point in the ball at an abscissa [m]."""
-        return self.width(s) - norm(split(point - self.position(s)))
+        return self.width(s) - norm(split(point - self.at(s)[0]))
 
 
 def curve_through(points: Float[Array, "points 3"], radius: Profile) -> Curve:
     """The centre line through points: two give a straight line."""
-    lengths = jnp.linalg.norm(jnp.diff(points, axis=0), axis=1)
-    knots = jnp.concatenate([jnp.zeros(1, points.dtype), jnp.cumsum(lengths)])
+    h = jnp.linalg.norm(jnp.diff(points, axis=0), axis=1)
+    knots = jnp.concatenate([jnp.zeros(1, points.dtype), jnp.cumsum(h)])
     slopes = jax.vmap(spline_slopes, (None, 1), 1)(knots, points)
-    return Curve(knots, points, slopes, radius)
+    h, left, right = h[:, None], slopes[:-1], slopes[1:]
+    secant = jnp.diff(points, axis=0) / h
+    bend, change = (3 * secant - 2 * left - right) / h, (left + right - 2 * secant) / h**2
+    inner = jnp.stack([points[:-1], left, bend, change], axis=1)
+    zero = jnp.zeros_like(points[0])
+    ends = [jnp.stack([points[i], slopes[i], zero, zero])[None] for i in (0, -1)]
+    starts = jnp.concatenate([knots[:1], knots])
+    return Curve(knots, starts, jnp.concatenate([ends[0], inner, ends[1]]), radius)
 
 
 def _stationarity(curve: Curve, point: Position, s: Scalar) -> tuple[Scalar, Scalar]:
     """Derivative of the depth in s, times the distance to the line, and its derivative in s."""
 
-    def scaled_rate(s: Scalar) -> Scalar:
-        centre, tangent = jax.jvp(curve.position, (s,), (jnp.ones_like(s),))
-        _, widening = jax.jvp(curve.width, (s,), (jnp.ones_like(s),))
-        apart = point - centre
-        return jnp.sum(apart * tangent) + widening * norm(split(apart))
+    def widening(s: Scalar) -> Scalar:
+        return jax.jvp(curve.width, (s,), (jnp.ones_like(s),))[1]
 
-    return jax.jvp(scaled_rate, (s,), (jnp.ones_like(s),))
+    centre, tangent, bend = curve.at(s)
+    first, second = jax.jvp(widening, (s,), (jnp.ones_like(s),))
+    apart = point - centre
+    away, along = norm(split(apart)), jnp.sum(apart * tangent)
+    approach = along / jnp.where(away > 0, away, 1.0)
+    rate = along + first * away
+    slope = jnp.sum(apart * bend) - jnp.sum(tangent**2) + second * away - first * approach
+    return rate, slope
 
 
 def _nearest(curve: Curve, point: Position) -> tuple[Scalar, Bool[Array, ""]]:
@@ -159,8 +170,8 @@ def _nearest(curve: Curve, point: Position) -> tuple[Scalar, Bool[Array, ""]]:
     there, which it is not where the radius has a kink."""
     samples, length = curve.samples, curve.knots[-1]
     first, last = (
-        jnp.sum((point - curve.points[i]) * curve.slopes[i]) / jnp.sum(curve.slopes[i] ** 2)
-        for i in (0, -1)
+        jnp.sum((point - end) * tangent) / jnp.sum(tangent**2)
+        for end, tangent in (curve.coefficients[i, :2] for i in (0, -1))
     )
     first, last = jnp.minimum(first, 0.0)[None], length + jnp.maximum(last, 0.0)[None]
     tried = jnp.concatenate([first, samples, last])

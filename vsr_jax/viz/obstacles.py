@@ -110,8 +110,8 @@ def _surface(obstacle: Obstacle, region: Region) -> Polygons:
         across = [i for i in range(3) if i != axis]
         cells = np.argwhere(crossed)
         cells = cells[np.all((cells[:, across] > 0) & (cells < number - 1)[:, across], axis=1)]
-        corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) @ np.eye(3, dtype=int)[across]
-        quads.append(cells[:, None] - corners)
+        around = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) @ np.eye(3, dtype=int)[across]
+        quads.append(cells[:, None] - around)
     middles = jnp.asarray(low + step * (np.concatenate(quads).reshape(-1, 3) + 0.5))
     corners = _projected(obstacle, middles, jnp.asarray(step))
     return list(np.asarray(corners, float).reshape(-1, 4, 3))
@@ -205,12 +205,10 @@ def _(obstacle: Tube, region: Region) -> Polygons:
         rings = _ring(_ANGLES) * float(obstacle.radii[0])
         return _facets(r + _with_third(np.stack([rings, rings]), x) @ R[:, [1, 2, 0]].T)
     curve = curve_through(obstacle.line, obstacle.radius)
-    s = np.linspace(0.0, float(curve.knots[-1]), _ALONG + 1).astype(curve.knots.dtype)
-    centre, tangent, width, widening = (
-        np.asarray(x, float)
-        for f in (curve.position, lambda s: curve.radius(s, curve.knots[-1]))
-        for x in jax.vmap(lambda at, f=f: jax.jvp(f, (at,), (at * 0 + 1,)))(s)
-    )
+    s = jnp.linspace(0.0, 1.0, _ALONG + 1, dtype=curve.knots.dtype) * curve.knots[-1]
+    centre, tangent, _ = (np.asarray(x, float) for x in jax.vmap(curve.at)(s))
+    radius = jax.vmap(lambda x: jax.jvp(lambda y: curve.radius(y, s[-1]), (x,), (0 * x + 1,)))
+    width, widening = (np.asarray(x, float) for x in radius(s))
     slope = np.clip(widening / np.linalg.norm(tangent, axis=1), -1.0, 1.0)
     tangent = tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
     across = _transported(tangent)
