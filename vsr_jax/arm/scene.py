@@ -13,12 +13,13 @@ from jaxtyping import Array, Bool, Float
 from ..numerics.component import Forces, Vector, Wrench, add, dot
 from ..numerics.quadrature import make_grid, piece_edges
 from ..typing import ArrayLike, DTypeLike, Scalar, VectorLike, cast
-from ..validation import ROUNDING, concrete, instance, is_traced, numbers, precise
+from ..validation import ROUNDING, concrete, instance, instances, is_traced, numbers, precise
 from .actuator import Actuator
 from .description import Part, describe, described_arguments, table
 from .loads import Frame, Load
 from .pose_loads import PoseLoad
 from .profile import Limits
+from .rigid_piece import check_pieces
 from .rod import STRAINS, Rod
 from .routing import Path, thread_tangent
 from .scene_numbers import checked_values, replaced
@@ -27,12 +28,13 @@ from .scene_numbers import checked_values, replaced
 class CrossSections(NamedTuple):
     r"""Cross-sections at given X: the diagonal of $\Sigma$ (6), $\xi^*$ (6), the `Path` of each
     thread, and its `reach`: 1 between its ends and 0 elsewhere, None if it extends over the whole
-    arm."""
+    arm; `flexible`: 0 on rigid pieces and 1 elsewhere, None without rigid pieces."""
 
     stiffness: Vector
     rest: Vector
     paths: tuple[Path, ...]
     reach: tuple[Array | None, ...]
+    flexible: Array | None
 
     def carry(self, forces: Forces) -> Forces:
         """Force of each thread here: equal to that at its start between its ends, else zero."""
@@ -62,6 +64,7 @@ class Scene(Part):
     - a size, a modulus, a density or the rest elongation is not positive somewhere,
     - a tube has no wall, or Poisson's ratio is out of its range,
     - a thread ends or a load acts beyond the arm,
+    - a rigid piece is beyond the arm, two of them overlap, or they cover all of the arm,
     - there is gravity and the material has no density.
 
     Only known numbers are checked, not those traced by `jax.jit`.
@@ -81,10 +84,12 @@ class Scene(Part):
         free_strains: Sequence[str] = STRAINS,
     ):
         self.rod = instance("Scene.rod", rod, Rod, "a Rod")
-        self.actuators = _each(
+        self.actuators = instances(
             "Scene.actuators", actuators, Actuator, "a Thread, Tendon or Chamber"
         )
-        self.loads = _each("Scene.loads", loads, Load, "a Gravity, TipWrench, Spring or other load")
+        self.loads = instances(
+            "Scene.loads", loads, Load, "a Gravity, TipWrench, Spring or other load"
+        )
         names = (free_strains,) if isinstance(free_strains, str) else tuple(free_strains)
         if not names or any(name not in STRAINS for name in names):
             raise ValueError(
@@ -116,6 +121,7 @@ class Scene(Part):
         names = [effects[0] for effects in (*threads, *loads)]
         names += [option for effects in loads for option in effects[1:]]
         names += ["sections"] if self.breakpoints else []
+        names += ["rigid pieces"] if self.rod.rigid else []
         names += [option for effects in threads for option in effects[1:]]
         if len(self.free_strains) < len(STRAINS):
             names.append("only " + ", ".join(self.free_strains))
@@ -163,7 +169,8 @@ class Scene(Part):
         def at(x: Scalar) -> CrossSections:
             paths = tuple(actuator.routing.path(x) for actuator in self.actuators)
             reach = tuple(actuator.reach(x) for actuator in self.actuators)
-            return CrossSections(self.rod.stiffness(x), self.rod.rest(x), paths, reach)
+            rod = self.rod
+            return CrossSections(rod.stiffness(x), rod.rest(x), paths, reach, rod.flexible(x))
 
         if X.ndim == 0:
             return at(X)
@@ -326,7 +333,9 @@ class Scene(Part):
                 )
 
     def _check_places(self, length: float) -> None:
-        """Raises `ValueError` if a thread end or a point load is beyond the arm."""
+        """Raises `ValueError` for rigid pieces that the arm cannot have, and if a thread end or a
+        point load is beyond the arm."""
+        check_pieces("Scene.rod.rigid", self.rod.rigid, length)
         beyond = length * (1 + ROUNDING)
         for i, actuator in enumerate(self.actuators):
             for name, x in (("start", actuator.start), ("end", actuator.end)):
@@ -349,11 +358,6 @@ class Scene(Part):
 def _line(part: Any) -> str:
     text = describe(part)
     return f"{text}, input in {part.unit}" if isinstance(part, Actuator) else text
-
-
-def _each(name: str, values: Any, kind: type, needed: str) -> tuple:
-    values = (values,) if isinstance(values, kind) else values
-    return tuple(instance(f"{name}[{i}]", value, kind, needed) for i, value in enumerate(values))
 
 
 @eqx.filter_jit

@@ -27,6 +27,7 @@ from ..arm.loads import DistributedWrench, Gravity, PointWrench, TipWrench
 from ..arm.material import Material
 from ..arm.pose_loads import MagneticDensity, MagneticMoment, Payload, Spinning, Spring
 from ..arm.profile import Constant, Piecewise, PolynomialProfile, SplineProfile, Taper
+from ..arm.rigid_piece import RigidPiece
 from ..arm.rod import Rod
 from ..arm.routing import Helix, Linear, Parallel, Polynomial, Spline
 from ..arm.scene import Scene
@@ -49,6 +50,7 @@ _PROFILES = _group(Constant, Taper, PolynomialProfile, SplineProfile, Piecewise)
 _SECTIONS = _group(Circular, Annular, Rectangular, Elliptic, Joined)
 _GROUPS = {
     "rod": _group(Rod),
+    "rigid": _group(RigidPiece),
     "material": _group(Material),
     "section": _SECTIONS,
     "sections": _SECTIONS,

@@ -60,6 +60,9 @@ def step_error(
     before, here, after, gap, span = _neighbours(xi[:3])
     h = grid.h[: here[0].size]
     lever = h * (1 - _TAPER * jnp.mean(grid.X, axis=0) / length)[: h.size]
+    if sections.flexible is not None:  # a jump of the curvature at an end of a rigid piece is exact
+        ends = _neighbours((sections.flexible,))[:3]
+        lever = lever * ends[0][0] * ends[1][0] * ends[2][0]
     change = tuple((b - a) / span for a, b in zip(before, after, strict=True))
     first = (span / 2) ** 2 * jnp.sum(lever * c.dot(change, change))
     bent = tuple(x - a - gap * d for x, a, d in zip(here, before, change, strict=True))
@@ -86,7 +89,7 @@ def _threads(
     """For each thread the phase of its wave per step, and the total angle by which it bends and
     shears the arm."""
     length, waves = jnp.sum(grid.h), []
-    lever = grid.weight * (1 - _TAPER * grid.X / length)
+    lever = c.times(sections.flexible, grid.weight * (1 - _TAPER * grid.X / length))
     softest = _softest(sections)
     hardest = jnp.max(
         softest
