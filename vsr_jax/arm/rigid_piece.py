@@ -47,17 +47,17 @@ class RigidPiece(Part):
             length if self.end is None else float(self.end),
         )
 
-    def covers(self, X: Scalar) -> Array:
-        """Whether X [m] lies on it, the ends included."""
+    def covers(self, X: Array) -> Array:
+        """Whether X [m], of any shape, lies on it, the ends included."""
         here = jnp.ones_like(X, bool) if self.start is None else self.start <= X
         return here if self.end is None else here & (self.end >= X)
 
 
-def flexibility(pieces: Sequence[RigidPiece], X: Scalar) -> Scalar | None:
-    """0 where X [m] lies on a rigid piece and 1 elsewhere; None without pieces."""
+def flexibility(pieces: Sequence[RigidPiece], X: Array) -> Array | None:
+    """0 where X [m], of any shape, lies on a rigid piece and 1 elsewhere; None without pieces."""
     if not pieces:
         return None
-    rigid = jnp.any(jnp.stack([piece.covers(X) for piece in pieces]))
+    rigid = jnp.any(jnp.stack([piece.covers(X) for piece in pieces]), axis=0)
     return jnp.where(rigid, jnp.zeros_like(X), jnp.ones_like(X))
 
 

@@ -97,8 +97,9 @@ class Rod(Part):
         """Diagonal of $\\Sigma$ at X [m], six scalars [N m^2] and [N]."""
         return self.material.stiffness(self.section, X, self.length)
 
-    def flexible(self, X: Scalar) -> Scalar | None:
-        """0 at X [m] on a rigid piece and 1 elsewhere; None without rigid pieces."""
+    def flexible(self, X: Array) -> Array | None:
+        """0 where X [m], of any shape, lies on a rigid piece and 1 elsewhere; None without rigid
+        pieces."""
         return flexibility(self.rigid, X)
 
     def limits(self, X: Scalar) -> Limits:
