@@ -3,7 +3,7 @@ constructor by name.
 
 The top level of a file contains the arguments of `Scene` and, optionally, a `title` and `inputs`.
 Units are those of the constructors. The type is optional where only one class is possible (`rod`,
-`material`). A profile can be a plain number.
+`material`, `rigid`). A profile can be a plain number.
 
 A new class needs an entry in its group below and a field for each argument of its constructor, of
 the same name. An argument without a field is read but not written, as `diameter` of `Circular`.

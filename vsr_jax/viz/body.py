@@ -110,7 +110,7 @@ def body_of(eq: Equilibrium | Summary, stations: VectorLike = 60) -> Body:
     return body_from_samples(eq, sample(eq, stations))
 
 
-def with_rigid_ends(rod: Rod, X: Float[Array, " stations"]) -> Float[Array, " stations"]:
+def with_rigid_ends(rod: Rod, X: Float[Array, " stations"]) -> Float[Array, " more"]:
     """Ascending stations [m] and between them the ends of rigid pieces."""
     ends = [jnp.clip(x, X[0], X[-1]) for piece in rod.rigid for x in piece.breakpoints]
     return jnp.sort(jnp.concatenate([X, jnp.stack(ends)])) if ends else X
