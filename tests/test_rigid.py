@@ -265,6 +265,24 @@ def test_a_basis_counts_beside_the_pieces(loads):
     np.testing.assert_array_equal(fine.strain(0.33), [0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
 
 
+@pytest.mark.parametrize("loads", [(), GRAVITY], ids=["bare", "gravity"])
+def test_a_section_of_a_basis_may_be_a_rigid_piece(loads):
+    """Its coordinates are zero, and the others are those of an arm with stiff material there."""
+    basis = vsr.Basis.uniform(vsr.PiecewiseConstant([0.1, START / LENGTH, END / LENGTH, 0.7]))
+    model, sections = vsr.Prescribed(basis, points=8, steps=16), slice(2, 30, 5)
+
+    def q(inputs):
+        return vsr.solve(scene(loads), inputs, model=model).q
+
+    found, near = q(INPUTS), vsr.solve(stiff(1e13, loads), INPUTS, model=model).q
+    np.testing.assert_array_equal(found[sections], 0)
+    np.testing.assert_allclose(found, near, rtol=0, atol=1e-5)
+    assert np.abs(found).max() > 1
+    jacobian, h = jax.jacfwd(q)(INPUTS), jnp.array([1e-4, 0.0])
+    change = (q(INPUTS + h) - q(INPUTS - h)) / 2e-4
+    np.testing.assert_allclose(jacobian[:, 0], change, rtol=0, atol=1e-6)
+
+
 def test_an_arm_without_rigid_pieces_computes_nothing_for_them():
     def operations(arm):
         values = jnp.zeros(len(arm.actuators))

@@ -97,11 +97,19 @@ def _imbalance(q: Array, projection: Projection, tau: Forces) -> Array:
 
 
 def _tangent(q: Array, projection: Projection, tau: Forces) -> Array:
-    return projection.stiffness(tangent(projection.strain(q), projection.sections, tau))
+    lower = tangent(projection.strain(q), projection.sections, tau)
+    return _regular(projection.stiffness(lower), projection)
+
+
+def _regular(K: Array, projection: Projection) -> Array:
+    """A stiffness matrix with ones for the coordinates of rigid pieces alone, which stay zero."""
+    if projection.sections.flexible is None:
+        return K
+    return K + jnp.diag(jnp.all(projection.matrix == 0, axis=(0, 1)).astype(K.dtype))
 
 
 def _find_projected(projection: Projection, tau: Forces) -> Root:
-    K = projection.elastic_stiffness()
+    K = _regular(projection.elastic_stiffness(), projection)
     elastic = lu.factor(K)
     axial = jnp.sum(projection.weight * force_scale(projection.sections.stiffness))
 
@@ -124,7 +132,8 @@ def _find_projected(projection: Projection, tau: Forces) -> Root:
 class Prescribed(SteppedModel):
     r"""Strain in a given basis, $\xi = B_q(X) q + \xi^*$, with $K q = B(q) \tau$ (eq. 18).
 
-    On rigid pieces the strain is $\xi^*$; the basis counts on the other parts of the arm only.
+    On rigid pieces the strain is $\xi^*$; the basis counts on the other parts of the arm only, and
+    the coordinates of functions that are zero there are zero.
 
     **Arguments:**
     - `basis`: an `AbstractBasis`, such as `Basis.uniform(Legendre(4))`.
