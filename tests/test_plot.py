@@ -7,6 +7,7 @@ import pytest
 mpl.use("Agg")
 
 import matplotlib.pyplot as plt
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 import vsr_jax as vsr
 from vsr_jax.arm.rod import STRAINS
@@ -106,6 +107,23 @@ def test_the_colour_bar_shows_the_signs_there_are(tensions, ends):
     scale = tension_scale([np.array(some) for some in tensions])
     assert (scale.low, scale.high) == ends
     assert scale.norm(0.0) == 0.5
+
+
+def test_rigid_pieces_have_a_wall_of_their_own():
+    pieces = [vsr.RigidPiece(0.101, 0.122), vsr.RigidPiece(0.25)]
+    rod = vsr.Rod(0.3, vsr.Circular(0.01), vsr.Material(6e5, poisson=0.4), rigid=pieces)
+    eq = vsr.solve(vsr.Scene(rod, vsr.Tendon(vsr.Parallel(0.006, 0.0))), [2.0])
+    body = body_of(eq, 31)
+    ends = [(body.samples.X[part][[0, -1]], rigid) for part, rigid in body.parts]
+    np.testing.assert_allclose(
+        [pair for pair, _ in ends], [(0, 0.101), (0.101, 0.122), (0.122, 0.25), (0.25, 0.3)]
+    )
+    assert [rigid for _, rigid in ends] == [False, True, False, True]
+    walls = [x for x in plot.arm(eq, stations=31).collections if isinstance(x, Poly3DCollection)]
+    alphas = [wall.get_alpha() for wall in walls if wall.get_alpha() is not None]
+    assert len(alphas) == 4
+    assert min(alphas[1], alphas[3]) > max(alphas[0], alphas[2])
+    plt.close("all")
 
 
 def test_discs_are_drawn_and_a_thin_arm_is_widened():

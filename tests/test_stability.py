@@ -70,9 +70,10 @@ def dense(scene, forces, nodes):
     grid, free = nodes.grid, scene.free
     loads, tau = loading(scene, grid), nodes.tau(forces)
     still = jnp.stack(free_components(nodes.xi, free))
+    held = nodes.sections._replace(rest=nodes.xi)
 
     def imbalance(values):
-        xi = with_locked(spread(tuple(values), free), nodes.xi, free)
+        xi = with_locked(spread(tuple(values), free), held, free)
         wrench = tuple(react(xi, grid, loads).wrench)
         return jnp.stack(free_components(residual(xi, nodes.sections, tau, wrench), free))
 

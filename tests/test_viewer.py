@@ -302,6 +302,26 @@ def test_the_tube_is_closed_and_its_faces_look_outward():
     assert sum(areas) == pytest.approx(body.area)
 
 
+def test_the_wall_of_a_rigid_piece_is_apart():
+    rod = bare().rod
+    held = vsr.Rod(rod.length, rod.section, rod.material, rigid=vsr.RigidPiece(0.153))
+    shape = shape_of(vsr.solve(vsr.Scene(held, vsr.Tendon(_along(0.005, 0.0))), [2.0], model=MODEL))
+    X, rings = shape.body.samples.X, shape.body.samples.wall
+    np.testing.assert_array_equal(shape.body.rigid, X[1:] > 0.153)
+    tube = mesh.tube(rings)
+    rigid = mesh.tube_parts(shape.body.rigid, rings.shape[1])
+    assert rigid.shape == tube.triangles.shape[:1]
+    bends, stiff = mesh.bands(tube, rigid.astype(int), 2)
+    first = np.searchsorted(X, 0.153)
+    np.testing.assert_allclose(X[first], 0.153, rtol=1e-12)
+    drawn = np.unique(stiff.vertices, axis=0)
+    tip = rings[-1, :-1].mean(axis=0)
+    there = np.unique(np.concatenate([rings[first:, :-1].reshape(-1, 3), tip[None]]), axis=0)
+    np.testing.assert_allclose(drawn, there, atol=1e-15)
+    assert len(bends.triangles) + len(stiff.triangles) == len(tube.triangles)
+    assert not np.any(shape.strain[first:])
+
+
 def test_threads_end_where_they_are_tied_and_slack_ones_are_dashed():
     scene = vsr.Scene(
         bare().rod,

@@ -1,7 +1,7 @@
 """Input validation: every error is a `ValueError` that names the argument, the value received and
 what is needed."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from types import UnionType
 from typing import Any
 
@@ -188,6 +188,14 @@ def choice(name: str, value: Any, allowed: Sequence[Any]) -> Any:
     if value not in allowed:
         raise _error(name, value, "one of " + ", ".join(repr(a) for a in allowed))
     return value
+
+
+def instances(name: str, values: Any, kind: type, needed: str) -> tuple:
+    """`values`, or one of them alone, as a tuple, if each is an instance of `kind`."""
+    values = (values,) if isinstance(values, kind) else values
+    if not isinstance(values, Iterable):
+        raise _error(name, values, f"{needed}, or several of them")
+    return tuple(instance(f"{name}[{i}]", value, kind, needed) for i, value in enumerate(values))
 
 
 def instance(name: str, value: Any, kind: type | UnionType | tuple[type, ...], needed: str) -> Any:

@@ -29,6 +29,7 @@ from ..mechanics.balance import free_components, spread, with_locked
 from ..mechanics.coupling import ArmProblem, forces_at
 from ..models.base import Outcome, Status, resolved
 from ..models.strain_dependent import StrainDependent
+from ..numerics.component import add, multiply, subtract
 from ..numerics.quadrature import Grid
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import admitted_status, solve
@@ -151,11 +152,13 @@ class _System(NamedTuple):
 
     def unknown(self, u: Array, problem: ArmProblem, free: tuple[int, ...]) -> ArmUnknown:
         """The unknowns as a structure; locked strains have their rest value."""
+        found = self._free_unknown(u, problem, free)
+        return found._replace(xi=with_locked(spread(found.xi, free), problem.sections, free))
+
+    def _free_unknown(self, u: Array, problem: ArmProblem, free: tuple[int, ...]) -> ArmUnknown:
         coupled = tuple(one.guess(problem.forces, problem.grid) for one in problem.couplings)
         like = ArmUnknown(free_components(problem.sections.rest, free), coupled)
-        found = ravel_pytree(_at_nodes(like, problem.grid))[1](u[:-1] / self.scale)
-        xi = with_locked(spread(found.xi, free), problem.sections.rest, free)
-        return found._replace(xi=xi)
+        return ravel_pytree(_at_nodes(like, problem.grid))[1](u[:-1] / self.scale)
 
     def residual(self, u: Array) -> Array:
         """Gradient of a dimensionless energy with respect to the unknowns in `u`."""
@@ -163,6 +166,11 @@ class _System(NamedTuple):
         unknown = self.unknown(u, problem, free)
         at = state_of(unknown.xi, unknown.coupled, problem)
         rows = imbalance_of(unknown, at, problem, free)
+        if problem.sections.flexible is not None:  # rows that keep the matrix regular there
+            given = self._free_unknown(u, problem, free).xi
+            off = subtract(given, free_components(unknown.xi, free))
+            held = multiply(free_components(problem.sections.stiffness, free), off)
+            rows = rows._replace(wrench=add(rows.wrench, held))
         wrench = tuple(problem.grid.weight * r for r in rows.wrench)
         flat, _ = ravel_pytree(rows._replace(wrench=wrench))
         bending = jnp.sum(problem.grid.weight * problem.sections.stiffness[1])

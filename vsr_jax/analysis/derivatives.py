@@ -157,7 +157,8 @@ def _compliance(eq: Equilibrium) -> Array:
     )
     poses = eq.pose(nodes.grid.X.reshape(-1))
     G = jax.vmap(lambda g: _carried(g, eq.tip))(poses)[:, free]
-    weight = jnp.broadcast_to(nodes.grid.weight, nodes.grid.X.shape).reshape(-1)
+    weight = c.times(nodes.sections.flexible, nodes.grid.weight)
+    weight = jnp.broadcast_to(weight, nodes.grid.X.shape).reshape(-1)
     found = jnp.einsum("x,xai,xaj->ij", weight, G, jnp.linalg.solve(H, G))
     return eq.masked(found)
 

@@ -20,7 +20,7 @@ from ..arm.scene import Scene
 from ..files.output import plain
 from ..mechanics.balance import free_components, thread_direction, thread_wrench
 from ..models.base import Model, Status
-from ..numerics.component import norm, scale, split
+from ..numerics.component import norm, scale, split, times
 from ..numerics.quadrature import make_grid
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
@@ -277,7 +277,8 @@ def _independence(scene: Scene) -> Scalar:
     ]
     B = jnp.stack([jnp.stack(jnp.broadcast_arrays(*w)) for w in wrenches])
     stiffness = jnp.stack(jnp.broadcast_arrays(*free_components(sections.stiffness, scene.free)))
-    K = jnp.einsum("iask,jask,ask,sk->ij", B, B, 1 / stiffness, grid.weight)
+    weight = times(sections.flexible, grid.weight)
+    K = jnp.einsum("iask,jask,ask,sk->ij", B, B, 1 / stiffness, weight)
     size = jnp.sqrt(jnp.diag(K))
     size = jnp.where(size > 0, size, 1.0)  # a thread without effect: a row of zeros
     return jnp.linalg.eigvalsh(K / (size[:, None] * size[None, :]))[0]

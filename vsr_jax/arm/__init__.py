@@ -27,6 +27,7 @@ from .profile import (
     SplineProfile,
     Taper,
 )
+from .rigid_piece import RigidPiece
 from .rod import STRAINS, Rod
 from .routing import Function, Helix, Linear, Parallel, Polynomial, Routing, Spline
 from .scene import CrossSections, Scene
@@ -71,6 +72,7 @@ __all__ = [
     "PoseLoad",
     "Profile",
     "Rectangular",
+    "RigidPiece",
     "Rod",
     "Routing",
     "Scene",

@@ -1,12 +1,14 @@
 """The rod: a slender arm with its section, material, rest strain and base."""
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..numerics.component import Vector, norm
 from ..typing import ArrayLike, MatrixLike, Pose, Scalar
-from ..validation import instance, numbers, rigid
+from ..validation import instance, instances, numbers, rigid as rigid_transform
 from .description import Part
 from .material import Material
 from .profile import (
@@ -17,6 +19,7 @@ from .profile import (
     breakpoints_of,
     values_at,
 )
+from .rigid_piece import RigidPiece, flexibility
 from .section import Section
 
 STRAINS = ("torsion", "bending_y", "bending_z", "elongation", "shear_y", "shear_z")
@@ -42,6 +45,7 @@ class Rod(Part):
       default.
     - `guide_radius`: radius [m] of discs that guide the threads outside the section; by default
       the threads are inside the section.
+    - `rigid`: the `RigidPiece`s of the arm, parts of it that do not bend.
     """
 
     length: Scalar = eqx.field(metadata={"unit": "m"})
@@ -50,6 +54,7 @@ class Rod(Part):
     rest_strain: ProfileVector = eqx.field(metadata={"unit": _STRAIN_UNITS})
     base: Pose | None = eqx.field(metadata={"unit": "-"})
     guide_radius: Scalar | None = eqx.field(metadata={"unit": "m"})
+    rigid: tuple[RigidPiece, ...]
 
     def __init__(
         self,
@@ -60,6 +65,7 @@ class Rod(Part):
         rest_strain: ProfilesLike | None = STRAIGHT,
         base: MatrixLike | None = None,
         guide_radius: ArrayLike | None = None,
+        rigid: Sequence[RigidPiece] | RigidPiece = (),
     ):
         self.length = numbers("Rod.length", length, positive=True)
         self.section = instance(
@@ -75,12 +81,13 @@ class Rod(Part):
             [f"Rod.rest_strain ({name})" for name in STRAINS],
             f"six profiles in the order {', '.join(STRAINS)}, or a function of X",
         )
-        self.base = None if base is None else rigid("Rod.base", base)
+        self.base = None if base is None else rigid_transform("Rod.base", base)
         self.guide_radius = (
             None
             if guide_radius is None
             else numbers("Rod.guide_radius", guide_radius, positive=True)
         )
+        self.rigid = instances("Rod.rigid", rigid, RigidPiece, "a RigidPiece")
 
     def rest(self, X: Scalar) -> Vector:
         """Rest strain $\\xi^*$ at X [m], six scalars."""
@@ -89,6 +96,11 @@ class Rod(Part):
     def stiffness(self, X: Scalar) -> Vector:
         """Diagonal of $\\Sigma$ at X [m], six scalars [N m^2] and [N]."""
         return self.material.stiffness(self.section, X, self.length)
+
+    def flexible(self, X: Array) -> Array | None:
+        """0 where X [m], of any shape, lies on a rigid piece and 1 elsewhere; None without rigid
+        pieces."""
+        return flexibility(self.rigid, X)
 
     def limits(self, X: Scalar) -> Limits:
         """Sizes, material properties and rest elongation at X [m] and their limits."""
@@ -128,9 +140,10 @@ class Rod(Part):
     @property
     def breakpoints(self) -> tuple[Scalar, ...]:
         """Abscissas [m] where a size, a material property, the rest strain or one of their
-        derivatives jumps."""
+        derivatives jumps, and the ends of rigid pieces."""
         return (
             *self.section.breakpoints,
             *self.material.breakpoints,
             *breakpoints_of(self.rest_strain),
+            *(x for piece in self.rigid for x in piece.breakpoints),
         )

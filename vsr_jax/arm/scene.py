@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 from ..numerics.component import Forces, Vector, Wrench, add, dot
 from ..numerics.quadrature import make_grid, piece_edges
 from ..typing import ArrayLike, DTypeLike, Scalar, VectorLike, cast
-from ..validation import concrete, instance, is_traced, numbers, precise
+from ..validation import instance, instances, is_traced, numbers, precise
 from .actuator import Actuator
 from .description import Part, describe, described_arguments, table
 from .held import Held
@@ -29,12 +29,13 @@ from .scene_numbers import checked_values, replaced
 class CrossSections(NamedTuple):
     r"""Cross-sections at given X: the diagonal of $\Sigma$ (6), $\xi^*$ (6), the `Path` of each
     thread, and its `reach`: 1 between its ends and 0 elsewhere, None if it extends over the whole
-    arm."""
+    arm; `flexible`: 0 on rigid pieces and 1 elsewhere, None without rigid pieces."""
 
     stiffness: Vector
     rest: Vector
     paths: tuple[Path, ...]
     reach: tuple[Array | None, ...]
+    flexible: Array | None
 
     def carry(self, forces: Forces) -> Forces:
         """Force of each thread here: equal to that at its start between its ends, else zero."""
@@ -66,6 +67,7 @@ class Scene(Part):
     - a size, a modulus, a density or the rest elongation is not positive somewhere,
     - a tube has no wall, or Poisson's ratio is out of its range,
     - a thread ends or a load acts beyond the arm,
+    - a rigid piece is beyond the arm, two of them overlap, or they cover all of the arm,
     - there is gravity and the material has no density,
     - an obstacle has no size, a tube is narrower than the arm, or the arm is inside an obstacle at
       rest or starts outside a tube.
@@ -91,18 +93,20 @@ class Scene(Part):
         obstacles: Sequence[Obstacle] | Obstacle = (),
     ):
         self.rod = instance("Scene.rod", rod, Rod, "a Rod")
-        self.actuators = _each(
+        self.actuators = instances(
             "Scene.actuators", actuators, Actuator, "a Thread, Tendon or Chamber"
         )
-        self.loads = _each("Scene.loads", loads, Load, "a Gravity, TipWrench, Spring or other load")
-        self.held = _each("Scene.held", held, Held, "a Held")
+        self.loads = instances(
+            "Scene.loads", loads, Load, "a Gravity, TipWrench, Spring or other load"
+        )
+        self.held = instances("Scene.held", held, Held, "a Held")
         names = (free_strains,) if isinstance(free_strains, str) else tuple(free_strains)
         if not names or any(name not in STRAINS for name in names):
             raise ValueError(
                 f"Scene.free_strains: got {free_strains!r}, need some of {', '.join(STRAINS)}"
             )
         self.free_strains = tuple(name for name in STRAINS if name in names)
-        self.obstacles = _each(
+        self.obstacles = instances(
             "Scene.obstacles", obstacles, Obstacle, "a Plane, Sphere, Tube or other obstacle"
         )
         for load in self.loads:
@@ -132,6 +136,7 @@ class Scene(Part):
         names += [obstacle.effect for obstacle in self.obstacles]
         names += [option for effects in loads for option in effects[1:]]
         names += ["sections"] if self.breakpoints else []
+        names += ["rigid pieces"] if self.rod.rigid else []
         names += [option for effects in threads for option in effects[1:]]
         if len(self.free_strains) < len(STRAINS):
             names.append("only " + ", ".join(self.free_strains))
@@ -186,7 +191,8 @@ class Scene(Part):
         def at(x: Scalar) -> CrossSections:
             paths = tuple(actuator.routing.path(x) for actuator in self.actuators)
             reach = tuple(actuator.reach(x) for actuator in self.actuators)
-            return CrossSections(self.rod.stiffness(x), self.rod.rest(x), paths, reach)
+            rod = self.rod
+            return CrossSections(rod.stiffness(x), rod.rest(x), paths, reach, rod.flexible(x))
 
         if X.ndim == 0:
             return at(X)
@@ -328,11 +334,6 @@ class Scene(Part):
 def _line(part: Any) -> str:
     text = describe(part)
     return f"{text}, input in {part.unit}" if isinstance(part, Actuator) else text
-
-
-def _each(name: str, values: Any, kind: type, needed: str) -> tuple:
-    values = (values,) if isinstance(values, kind) else values
-    return tuple(instance(f"{name}[{i}]", value, kind, needed) for i, value in enumerate(values))
 
 
 @eqx.filter_jit

@@ -18,6 +18,7 @@ from .held import Held
 from .loads import Load
 from .obstacles import Obstacle
 from .profile import Limits
+from .rigid_piece import check_pieces
 from .rod import Rod
 
 _PROBES = 65
@@ -70,7 +71,9 @@ def check_numbers(
 def _check_places(
     length: float, rod: Rod, actuators: Sequence[Actuator], loads: Sequence[Load]
 ) -> None:
-    """Raises `ValueError` if a thread end or a point load is beyond the arm."""
+    """Raises `ValueError` for rigid pieces that the arm cannot have, and if a thread end or a point
+    load is beyond the arm."""
+    check_pieces("Scene.rod.rigid", rod.rigid, length)
     beyond = length * (1 + ROUNDING)
     for i, actuator in enumerate(actuators):
         for name, x in (("start", actuator.start), ("end", actuator.end)):

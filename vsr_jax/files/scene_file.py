@@ -3,7 +3,7 @@ constructor by name.
 
 The top level of a file contains the arguments of `Scene` and, optionally, a `title` and `inputs`.
 Units are those of the constructors. The type is optional where only one class is possible (`rod`,
-`material`). A profile can be a plain number.
+`material`, `rigid`). A profile can be a plain number.
 
 A new class needs an entry in its group below and a field for each argument of its constructor, of
 the same name. An argument without a field is read but not written, as `diameter` of `Circular`.
@@ -29,6 +29,7 @@ from ..arm.material import Material
 from ..arm.obstacles import Box, Cylinder, Plane, Sphere
 from ..arm.pose_loads import MagneticDensity, MagneticMoment, Payload, Spinning, Spring
 from ..arm.profile import Constant, Piecewise, PolynomialProfile, SplineProfile, Taper
+from ..arm.rigid_piece import RigidPiece
 from ..arm.rod import Rod
 from ..arm.routing import Helix, Linear, Parallel, Polynomial, Spline
 from ..arm.scene import Scene
@@ -52,6 +53,7 @@ _PROFILES = _group(Constant, Taper, PolynomialProfile, SplineProfile, Piecewise)
 _SECTIONS = _group(Circular, Annular, Rectangular, Elliptic, Joined)
 _GROUPS = {
     "rod": _group(Rod),
+    "rigid": _group(RigidPiece),
     "material": _group(Material),
     "section": _SECTIONS,
     "sections": _SECTIONS,

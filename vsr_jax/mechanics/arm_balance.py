@@ -146,5 +146,5 @@ def rounding_of(problem: ArmProblem) -> Array:
             size = jnp.abs(part)
             levers = length * jnp.sum(size[3:], axis=0)
             wrench = (*components(size[:3] + levers), *components(size[3:]))
-            total = total + largest(shape_of(wrench, sections.stiffness, length))
+            total = total + largest(shape_of(wrench, sections, length))
     return 64 * jnp.finfo(total.dtype).eps * total

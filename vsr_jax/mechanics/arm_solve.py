@@ -51,12 +51,12 @@ def solve_arm(problem: ArmProblem, free: tuple[int, ...], guess: ArmUnknown | No
 
     def find(problem: ArmProblem, guess: ArmUnknown | None) -> Root:
         if guess is not None:  # the iteration does not change the locked strains
-            guess = guess._replace(xi=with_locked(guess.xi, problem.sections.rest, free))
+            guess = guess._replace(xi=with_locked(guess.xi, problem.sections, free))
         root = side_by_side(partial(_solve, free))(_start(problem, free), guess, problem)
         return root._replace(x=root.x._replace(xi=free_components(root.x.xi, free)))
 
     def whole(x: ArmUnknown, problem: ArmProblem) -> ArmUnknown:
-        return x._replace(xi=completed(x.xi, problem.sections.rest, free))
+        return x._replace(xi=completed(x.xi, problem.sections, free))
 
     def imbalance(x: ArmUnknown, problem: ArmProblem, _: ArmUnknown | None) -> ArmImbalance:
         unknown = whole(x, problem)
@@ -102,7 +102,7 @@ def _start(problem: ArmProblem, free: tuple[int, ...]) -> ArmUnknown:
         jnp.where(near, x, x0).astype(exact.dtype)
         for x, x0, exact in zip(xi, rest, problem.sections.rest, strict=True)
     )
-    return ArmUnknown(with_locked(xi, problem.sections.rest, free), coupled)
+    return ArmUnknown(with_locked(xi, problem.sections, free), coupled)
 
 
 class _Sizes(NamedTuple):
@@ -125,7 +125,7 @@ class _Sizes(NamedTuple):
         """Root mean square of all rows."""
         grid, length = self.problem.grid, self.problem.length
         wrench = spread(imbalance.wrench, self.free)
-        bent = shape_of(wrench, self.problem.sections.stiffness, length)
+        bent = shape_of(wrench, self.problem.sections, length)
         square = jnp.sum(grid.weight * bent**2, axis=(0, 1)) / length
         for coupling, rows in zip(self.problem.couplings, imbalance.coupled, strict=True):
             for size in coupling.row_sizes(rows, at, self.problem):

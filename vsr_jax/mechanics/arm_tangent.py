@@ -50,7 +50,7 @@ def approximate_solve(
     unknown, at, right, problem, damping = c.single(
         (unknown, at, right, problem, jnp.asarray(damping))
     )
-    sections, grid = problem.sections, problem.grid
+    sections, grid, flexible = problem.sections, problem.grid, problem.sections.flexible
     lower = tangent(unknown.xi, sections, at.tau)
     lower = tuple(
         (*row[:-1], row[-1] + damping * s) for row, s in zip(lower, sections.stiffness, strict=True)
@@ -61,8 +61,8 @@ def approximate_solve(
 
     def solve(b: Vector) -> tuple[Vector, Definiteness]:
         if along is not None and slopes is not None and slopes.motion == 6:
-            return eliminate_poses(lower, b, unknown.xi, along, slopes, grid, free)
-        return eliminate(lower, b, along, slopes, grid, free)
+            return eliminate_poses(lower, b, unknown.xi, along, slopes, grid, free, flexible)
+        return eliminate(lower, b, along, slopes, grid, free, flexible)
 
     strain, (negative, doubtful) = solve(spread(right.wrench, free))
     borders, border = borders_of(problem, unknown.coupled, at)

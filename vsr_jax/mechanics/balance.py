@@ -19,6 +19,9 @@ with $P = [-\tilde d, 1]$, is symmetric. Symbols, each a tuple of component arra
 - $d = (0, d_y, d_z)$ [m]: where a thread crosses the section; $t_c = k \times d + u + d'$ its
   tangent, $t = t_c / |t_c|$;
 - `tau` [N]: thread force, negative for a tendon; `reaction` $= \Lambda$ [N m, N].
+
+On rigid pieces the strain is $\xi^*$ and no unknown: r is zero there, and H is $\Sigma$, so that
+it stays positive definite.
 """
 
 from collections.abc import Callable
@@ -45,6 +48,7 @@ from ..numerics.component import (
     scale,
     single,
     subtract,
+    times,
 )
 from ..numerics.implicit import implicit_root
 from ..numerics.newton import Evaluation, Root, newton
@@ -107,15 +111,16 @@ def residual(
     xi: Vector, sections: CrossSections, tau: Forces, reaction: Vector | None = None
 ) -> Vector:
     """Residual of a cross-section (eq. 21): $r = \\Sigma (\\xi - \\xi^*) - B_\\tau \\tau -
-    \\Lambda$."""
+    \\Lambda$, zero on rigid pieces."""
     elastic = multiply(sections.stiffness, subtract(xi, sections.rest))
     r = subtract(elastic, actuation_wrench(xi, sections, tau))
-    return r if reaction is None else subtract(r, reaction)
+    return times(sections.flexible, r if reaction is None else subtract(r, reaction))
 
 
 def tangent(xi: Vector, sections: CrossSections, tau: Forces) -> Matrix:
-    """Lower triangle of the tangent stiffness (eq. 12-13): $H = \\Sigma - A$."""
-    zero = jnp.zeros_like(xi[0])
+    """Lower triangle of the tangent stiffness (eq. 12-13): $H = \\Sigma - A$, on rigid pieces
+    $\\Sigma$."""
+    zero, tau = jnp.zeros_like(xi[0]), times(sections.flexible, tau)
     elastic = tuple((*[zero] * i, sections.stiffness[i]) for i in range(6))
 
     def less(lower: Matrix, path: Path, force: Array) -> Matrix:
@@ -147,9 +152,9 @@ def force_scale(stiffness: Vector) -> Array:
     return stiffness[3]
 
 
-def largest_force_scale(stiffness: Vector) -> Array:
-    """Largest `force_scale` of the nodes of an arm [N]."""
-    return jnp.max(force_scale(stiffness), axis=(0, 1))
+def largest_force_scale(sections: CrossSections) -> Array:
+    """Largest `force_scale` of the flexible nodes of an arm [N]."""
+    return jnp.max(times(sections.flexible, force_scale(sections.stiffness)), axis=(0, 1))
 
 
 def strain_norm(wrench: Vector, stiffness: Vector) -> Array:
@@ -193,23 +198,30 @@ def spread(vector: Vector, free: tuple[int, ...]) -> Vector:
     )
 
 
-def completed(free_part: Vector, locked: Vector, free: tuple[int, ...]) -> Vector:
-    """Six strains from the free ones, with the others from `locked`."""
+def completed(free_part: Vector, sections: CrossSections, free: tuple[int, ...]) -> Vector:
+    """Six strains from the free ones, with the rest strain in the others and on rigid pieces."""
     one = free_part[0]
     return tuple(
-        free_part[free.index(i)]
+        _flexed(free_part[free.index(i)], sections.rest[i], sections)
         if i in free
-        else jnp.broadcast_to(locked[i], one.shape).astype(one.dtype)
+        else jnp.broadcast_to(sections.rest[i], one.shape).astype(one.dtype)
         for i in range(6)
     )
 
 
-def with_locked(xi: Vector, locked: Vector, free: tuple[int, ...]) -> Vector:
-    """The free strains of `xi` with the others from `locked`."""
+def with_locked(xi: Vector, sections: CrossSections, free: tuple[int, ...]) -> Vector:
+    """The free strains of `xi`, with the rest strain in the others and on rigid pieces."""
     return tuple(
-        x if i in free else jnp.broadcast_to(y, x.shape)
-        for i, (x, y) in enumerate(zip(xi, locked, strict=True))
+        _flexed(x, rest, sections) if i in free else jnp.broadcast_to(rest, x.shape)
+        for i, (x, rest) in enumerate(zip(xi, sections.rest, strict=True))
     )
+
+
+def _flexed(x: Array, rest: Array, sections: CrossSections) -> Array:
+    """A strain where the arm can bend, its rest value on rigid pieces."""
+    if sections.flexible is None:
+        return x
+    return jnp.where(sections.flexible > 0, x, rest).astype(x.dtype)
 
 
 def newton_step(
@@ -241,7 +253,8 @@ def solve_balance(
 
     **Arguments:** component arrays of one shape.
     - `reaction`: $\Lambda$, None without external loads.
-    - `free`: indices of the strains that are solved for; the others keep their rest value.
+    - `free`: indices of the strains that are solved for; the others keep their rest value, as all
+      do on rigid pieces.
     - `start`: strain to start from. A section under compression and loads may have several
       solutions, and near collapse Newton's method from rest may miss the only one.
 
@@ -252,13 +265,13 @@ def solve_balance(
         x: Vector, sections: CrossSections, tau: Forces, reaction: Vector | None, _: Vector | None
     ) -> Vector:
         return free_components(
-            residual(completed(x, sections.rest, free), sections, tau, reaction), free
+            residual(completed(x, sections, free), sections, tau, reaction), free
         )
 
     def linear_solve(
         x: Vector, sections: CrossSections, tau: Forces, _: Any, __: Any, right: Vector
     ) -> Vector:
-        lower = tangent(completed(x, sections.rest, free), sections, tau)
+        lower = tangent(completed(x, sections, free), sections, tau)
         return cholesky_solve(cholesky(free_block(lower, free)), right)
 
     def at_rest(x: Vector, sections: CrossSections, tau: Forces, *others: Vector | None) -> tuple:
@@ -274,9 +287,7 @@ def solve_balance(
         reaction,
         start,
     )
-    return Balance(
-        completed(root.x, sections.rest, free), root.converged, root.definite, root.steps
-    )
+    return Balance(completed(root.x, sections, free), root.converged, root.definite, root.steps)
 
 
 def _find_balance(
@@ -305,7 +316,7 @@ def _find_balance(
         size = jnp.sqrt(dot(step, multiply(free_components(stiffness, free), step)) * per_force)
         return Evaluation(spread(step, free), size, jnp.sqrt(dot(r, elastic) * per_force), definite)
 
-    first = rest if start is None else with_locked(start, rest, free)
+    first = rest if start is None else with_locked(start, sections, free)
     xi, definite, steps = newton(evaluate, first, floor)
     imbalance = spread(free_components(residual(xi, sections, tau, reaction), free), free)
     balanced = strain_norm(imbalance, stiffness) <= 16 * floor

@@ -113,7 +113,7 @@ class Lengths(Coupling):
 
     def row_sizes(self, rows: Array, at: ArmState, problem: ArmProblem) -> list[Array]:
         """Slack per length of the arm."""
-        axial = largest_force_scale(problem.sections.stiffness)
+        axial = largest_force_scale(problem.sections)
         return [row / axial for row in rows]
 
     def units(self, problem: ArmProblem) -> tuple[Array, Array]:
@@ -144,7 +144,7 @@ def cable_of(
     stiffness = scene.actuators[place].cable_stiffness
     length = path_length(sections.rest, sections, place, grid) + change
     compliance = None if stiffness is None else 1 / stiffness
-    scale = largest_force_scale(sections.stiffness) / scene.rod.length
+    scale = largest_force_scale(sections) / scene.rod.length
     return Cable(length, compliance, scale)
 
 

@@ -54,7 +54,8 @@ class StepNodes(NamedTuple):
     r"""What the elimination needs of the nodes of a step, in the world frame but for H and b: the
     length h of the step; the rotations, the blocks of H (3, 3), the right side b (6), the axis u,
     the wrench (6) and its density (6); the derivatives (6, 3) of the load density at the nodes and
-    of the loads at the end of the step by rotations, None where there are none.
+    of the loads at the end of the step by rotations, None where there are none; `flexible` of the
+    sections.
 
     Behind the components come the axis of the nodes (but for h and `jump`) and those of steps or
     arms.
@@ -71,6 +72,7 @@ class StepNodes(NamedTuple):
     density: Array
     slope: Array | None
     jump: Array | None
+    flexible: Array | None
 
 
 class Sections(NamedTuple):
@@ -128,6 +130,7 @@ def eliminate(
     slopes: Slopes | None,
     grid: Grid,
     free: tuple[int, ...],
+    flexible: Array | None = None,
 ) -> tuple[Vector, Definiteness]:
     r"""Solution of the tangent system with the right side $b$ for the free strains, and the
     `Definiteness` of the tangent.
@@ -138,16 +141,18 @@ def eliminate(
     - `along`, `slopes`: the reaction where the tangent is taken, and the derivatives of the loads.
       Without loads only $H$ is solved, node by node.
     - `free`: the strains that are not locked.
+    - `flexible`: 0 on rigid pieces and 1 elsewhere, None without rigid pieces.
 
-    **Returns:** six components, zero for the locked strains; meaningless where the tangent is not
-    definite.
+    **Returns:** six components, zero for the locked strains and on rigid pieces; meaningless where
+    the tangent is not definite.
     """
     if along is None or slopes is None or min(free) > 2:
+        right = c.times(flexible, right)
         x = c.cholesky_solve(c.cholesky(free_block(lower, free)), free_components(right, free))
         unstable = jnp.any(jnp.isnan(x[-1]), axis=(0, 1))
         negative = jnp.where(unstable, UNSTABLE_SECTION, 0).astype(jnp.int32)
         return spread(x, free), Definiteness(negative, jnp.zeros_like(unstable))
-    nodes = _nodes(c.symmetric(lower), right, along, slopes, grid)
+    nodes = _nodes(c.symmetric(lower), right, along, slopes, grid, flexible)
     arms, size = nodes.axis.shape[3:], 6 if slopes.motion else 3
     nodes = _apart(nodes, grid) if arms else nodes
     last = -1 - len(arms)  # the axis of the steps
@@ -187,7 +192,14 @@ def eliminate(
     return strain, definiteness(negative + local, stable, asymmetry, grid)
 
 
-def _nodes(H: Matrix, right: Vector, along: Reaction, slopes: Slopes, grid: Grid) -> StepNodes:
+def _nodes(
+    H: Matrix,
+    right: Vector,
+    along: Reaction,
+    slopes: Slopes,
+    grid: Grid,
+    flexible: Array | None,
+) -> StepNodes:
     """The nodes of all steps, in the last axes (stages, steps, *arms)."""
     everything = (*H[0], *right, grid.weight, *along.world, *along.axis)
     shape = jnp.broadcast_shapes(*(x.shape for x in everything))
@@ -213,6 +225,7 @@ def _nodes(H: Matrix, right: Vector, along: Reaction, slopes: Slopes, grid: Grid
         whole(along.density),
         None if slopes.density is None else whole(slopes.density),
         None if jump is None else jnp.broadcast_to(jump, (*jump.shape[:2], *shape[1:])),
+        None if flexible is None else whole(flexible),
     )
 
 
@@ -289,9 +302,11 @@ def _condensed(node: StepNodes, free: tuple[int, ...]) -> tuple[Sections, Conden
 def _sections(node: StepNodes, n: Array, free: tuple[int, ...]) -> tuple[Sections, Array]:
     """The nodes of a step each alone, and whether their sections are stable by themselves."""
     linear, below = inverse_block(node.linear, tuple(i - 3 for i in free if i > 2))
+    linear = c.times(node.flexible, linear)
     across = matmul(node.mixed, linear)
     stiff = once(node.bending - matmul(across, transpose(node.mixed)))
     compliance, negative = inverse_block(stiff, tuple(i for i in free if i < 3))
+    compliance = c.times(node.flexible, compliance)
     R = node.rotation[:, :, None]
     three = jnp.stack([compliance, linear, across], axis=2)
     three = matmul(matmul(R, three), transpose(R))

@@ -30,7 +30,7 @@ class Node(NamedTuple):
     """What the elimination needs of a node: the blocks of the tangent H (3, 3), the right side
     (6), the axis u, the reaction (6), the rotation (3, 3) and its weight; the derivatives (6,
     motion) of the load density, and of the load at the end of its cell in the world frame, None
-    where there are none."""
+    where there are none; whether the section is `flexible`, 1 or 0, None without rigid pieces."""
 
     bending: Array
     mixed: Array
@@ -42,6 +42,7 @@ class Node(NamedTuple):
     weight: Array
     density: Array | None
     jump: Array | None
+    flexible: Array | None
 
 
 class Definiteness(NamedTuple):
@@ -54,7 +55,13 @@ class Definiteness(NamedTuple):
 
 
 def nodes_of(
-    H: Matrix, right: Vector, xi: Vector, along: Reaction, slopes: Slopes, grid: Grid
+    H: Matrix,
+    right: Vector,
+    xi: Vector,
+    along: Reaction,
+    slopes: Slopes,
+    grid: Grid,
+    flexible: Array | None,
 ) -> Node:
     """The nodes one after another along the arm, in the first axis."""
     everything = (*right, *xi, grid.weight, *along.wrench)
@@ -90,6 +97,7 @@ def nodes_of(
         listed(grid.weight),
         slope(density),
         slope(jump),
+        None if flexible is None else listed(flexible),
     )
 
 

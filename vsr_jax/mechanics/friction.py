@@ -276,7 +276,7 @@ def balanced_strain_rate(
     free: tuple,
 ) -> Vector:
     r"""Derivative of the balanced strain along the arm, $\xi' = H^{-1} (\Lambda' - \partial r /
-    \partial X + B_\tau \tau')$, six components.
+    \partial X + B_\tau \tau')$, six components; $\xi^{*\prime}$ on rigid pieces.
 
     **Arguments:** `tau_rate`: $\tau'$; `reaction_rate`: $\Lambda'$, None without loads; `rate`: the
     derivative of `sections` along the arm.
@@ -289,7 +289,8 @@ def balanced_strain_rate(
     right = c.subtract(actuation_wrench(xi, sections, tau_rate), change)
     right = right if reaction_rate is None else c.add(right, reaction_rate)
     factor = c.cholesky(free_block(tangent(xi, sections, tau), free))
-    return completed(c.cholesky_solve(factor, free_components(right, free)), rate.rest, free)
+    free_rate = c.cholesky_solve(factor, free_components(right, free))
+    return completed(free_rate, sections._replace(rest=rate.rest), free)
 
 
 def _alike(values: tuple, rates: tuple) -> tuple[Any, Any]:

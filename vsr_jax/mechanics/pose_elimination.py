@@ -49,6 +49,7 @@ class PoseCell(NamedTuple):
     - Over the cell the wrench changes by `by_motion` z + `by_strain` $\delta\xi$, without the part
       through P.
     - `jump`: derivative of the load at the end of the cell by its motion, None without such loads.
+    - `flexible`: 1, or 0 where the section is rigid; None without rigid pieces.
     """
 
     width: Array
@@ -61,6 +62,7 @@ class PoseCell(NamedTuple):
     by_motion: Array
     by_strain: Array
     jump: Array | None
+    flexible: Array | None
 
 
 def eliminate_poses(
@@ -71,9 +73,10 @@ def eliminate_poses(
     slopes: Slopes,
     grid: Grid,
     free: tuple[int, ...],
+    flexible: Array | None = None,
 ) -> tuple[Vector, Definiteness]:
     """As `eliminate`, for motions of size 6."""
-    nodes = nodes_of(c.symmetric(lower), right, xi, along, slopes, grid)
+    nodes = nodes_of(c.symmetric(lower), right, xi, along, slopes, grid, flexible)
     cells = jax.vmap(_cell_of)(nodes, turns(nodes.rotation))
     arms = nodes.weight.shape[1:]
     nothing = jnp.zeros((6, 7, *arms), cells.width.dtype)
@@ -116,6 +119,7 @@ def _cell_of(node: Node, turn: Array) -> PoseCell:
         by_motion,
         0.5 * w * by_motion + by_strain,
         None if node.jump is None else seen_from(node.rotation, node.jump),
+        node.flexible,
     )
 
 
@@ -136,6 +140,10 @@ def _cell(free: tuple[int, ...], end: Array, cell: PoseCell) -> tuple[Array, tup
     X, negative, compliance = _solved(
         cell.stiff - w * square, jnp.concatenate([by_start, constant], axis=1), free
     )
+    if cell.flexible is not None:
+        bends = cell.flexible > 0
+        X, compliance = (jnp.where(bends, x, 0.0) for x in (X, compliance))
+        negative = jnp.where(bends, negative, 0)
     start = 2.0 * middle - P  # of the wrench at the start of the cell, without its own loads
     square = once(_from_right(columns(start, 0, 6), lever))
     by_start = 2.0 * square - columns(start, 0, 6) + cell.by_motion

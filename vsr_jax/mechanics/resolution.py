@@ -20,10 +20,13 @@ Gauss nodes per step.
 - Magnus series. Its first neglected term where the curvature changes by $\delta k$ over a step,
   $c_s (h |k|)^{2s-1} |\delta k|$ with $c_s = 1/12, 1/720, 1/30240$ (Bernoulli numbers; the series
   diverges beyond $2 \pi$).
+
+Rigid pieces are left out: the steps on both sides of one are neighbours.
 """
 
 import math
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
@@ -56,11 +59,17 @@ def step_error(
     (stages, steps); the force of each thread at its start; whether there are external loads.
     """
     xi, sections, forces, grid = lax.stop_gradient(c.single((xi, sections, forces, grid)))
+    if sections.flexible is not None:  # behind the others: there the curvature jumps, exactly
+        order = jnp.argsort(sections.flexible[0] == 0)
+        xi, sections, grid = jax.tree.map(lambda x: x[..., order], (xi, sections, grid))
     stages, length = grid.X.shape[0], jnp.sum(grid.h)
     before, here, after, gap, span = _neighbours(xi[:3])
     h = grid.h[: here[0].size]
     lever = h * (1 - _TAPER * jnp.mean(grid.X, axis=0) / length)[: h.size]
     change = tuple((b - a) / span for a, b in zip(before, after, strict=True))
+    if sections.flexible is not None:
+        bends = jnp.prod(jnp.stack([x for (x,) in _neighbours((sections.flexible,))[:3]]), axis=0)
+        lever, change = bends * lever, c.scale(bends, change)
     first = (span / 2) ** 2 * jnp.sum(lever * c.dot(change, change))
     bent = tuple(x - a - gap * d for x, a, d in zip(here, before, change, strict=True))
     second = jnp.sum(lever * c.dot(bent, bent))
@@ -86,7 +95,7 @@ def _threads(
     """For each thread the phase of its wave per step, and the total angle by which it bends and
     shears the arm."""
     length, waves = jnp.sum(grid.h), []
-    lever = grid.weight * (1 - _TAPER * grid.X / length)
+    lever = c.times(sections.flexible, grid.weight * (1 - _TAPER * grid.X / length))
     softest = _softest(sections)
     hardest = jnp.max(
         softest

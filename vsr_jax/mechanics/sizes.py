@@ -21,17 +21,17 @@ def shape_size(strain: Vector, length: Array) -> Array:
     return jnp.sqrt(length**2 * c.dot(strain[:3], strain[:3]) + c.dot(strain[3:], strain[3:]))
 
 
-def shape_of(wrench: Vector, stiffness: Vector, length: Array) -> Array:
-    """`shape_size` of the strain that a wrench causes at rest."""
-    return shape_size(tuple(f / s for f, s in zip(wrench, stiffness, strict=True)), length)
+def shape_of(wrench: Vector, sections: CrossSections, length: Array) -> Array:
+    """`shape_size` of the strain that a wrench causes at rest, zero on rigid pieces."""
+    strain = tuple(f / s for f, s in zip(wrench, sections.stiffness, strict=True))
+    return c.times(sections.flexible, shape_size(strain, length))
 
 
 def pull_of(sections: CrossSections, place: int, length: Array) -> Array:
     """`shape_size` of the strain per unit of a thread's force at rest [1/N]."""
     path = sections.paths[place]
-    return shape_of(
-        thread_wrench(thread_direction(sections.rest, path)[0], path), sections.stiffness, length
-    )
+    wrench = thread_wrench(thread_direction(sections.rest, path)[0], path)
+    return shape_of(wrench, sections, length)
 
 
 def softest(stiffness: Vector) -> Array:

@@ -18,7 +18,7 @@ from ..mechanics.balance import thread_direction, thread_wrench
 from ..mechanics.coupling import ArmProblem
 from ..mechanics.reaction import Loading, loading
 from ..mechanics.resolution import COARSE, step_error
-from ..numerics.component import Forces, Vector, dot
+from ..numerics.component import Forces, Vector, dot, times
 from ..numerics.magnus import step_components, step_poses, tip_pose
 from ..numerics.quadrature import Grid, gauss_legendre, locate, make_grid
 from ..numerics.se3 import exp_components, pose
@@ -364,9 +364,8 @@ def _exhausted(force: Array, path: Path, sections: CrossSections) -> Array:
     w^T \Sigma^{-1} w \ge |t_c|$."""
     t, length = thread_direction(sections.rest, path)
     w = thread_wrench(t, path)
-    return jnp.any(
-        -force * dot(w, tuple(x / s for x, s in zip(w, sections.stiffness, strict=True))) >= length
-    )
+    pull, strain = -force, tuple(x / s for x, s in zip(w, sections.stiffness, strict=True))
+    return jnp.any(pull * times(sections.flexible, dot(w, strain)) >= length)
 
 
 def rest_where_failed(status: Array, xi: Vector, sections: CrossSections) -> Vector:

@@ -64,12 +64,17 @@ class Projection(NamedTuple):
         return jnp.einsum("xia,xib->ab", self.matrix, weighted)
 
 
+def basis_at(scene: Scene, basis: AbstractBasis, X: Scalar) -> Float[Array, "6 dofs"]:
+    """The basis $B_q(X)$ on the arm of a scene, zero on rigid pieces."""
+    return c.times(scene.rod.flexible(X), basis.matrix(X, scene.rod.length))
+
+
 def project(scene: Scene, basis: AbstractBasis, points: int) -> Projection:
     """Basis and cross-sections at `points` Gauss points on each smooth piece of the arm."""
     length = scene.rod.length
     grid = make_grid(scene.edges(basis.breakpoints(length)), 1, points)
     X = grid.X.reshape(-1)
-    matrix = jax.vmap(lambda x: basis.matrix(x, length))(X)
+    matrix = jax.vmap(lambda x: basis_at(scene, basis, x))(X)
     return Projection(scene.sections(X), grid.weight.reshape(-1), matrix)
 
 
@@ -92,11 +97,19 @@ def _imbalance(q: Array, projection: Projection, tau: Forces) -> Array:
 
 
 def _tangent(q: Array, projection: Projection, tau: Forces) -> Array:
-    return projection.stiffness(tangent(projection.strain(q), projection.sections, tau))
+    lower = tangent(projection.strain(q), projection.sections, tau)
+    return _regular(projection.stiffness(lower), projection)
+
+
+def _regular(K: Array, projection: Projection) -> Array:
+    """A stiffness matrix with ones for the coordinates of rigid pieces alone, which stay zero."""
+    if projection.sections.flexible is None:
+        return K
+    return K + jnp.diag(jnp.all(projection.matrix == 0, axis=(0, 1)).astype(K.dtype))
 
 
 def _find_projected(projection: Projection, tau: Forces) -> Root:
-    K = projection.elastic_stiffness()
+    K = _regular(projection.elastic_stiffness(), projection)
     elastic = lu.factor(K)
     axial = jnp.sum(projection.weight * force_scale(projection.sections.stiffness))
 
@@ -118,6 +131,9 @@ def _find_projected(projection: Projection, tau: Forces) -> Root:
 
 class Prescribed(SteppedModel):
     r"""Strain in a given basis, $\xi = B_q(X) q + \xi^*$, with $K q = B(q) \tau$ (eq. 18).
+
+    On rigid pieces the strain is $\xi^*$; the basis counts on the other parts of the arm only, and
+    the coordinates of functions that are zero there are zero.
 
     **Arguments:**
     - `basis`: an `AbstractBasis`, such as `Basis.uniform(Legendre(4))`.
@@ -171,7 +187,7 @@ class Prescribed(SteppedModel):
         rated = problem.follows_rate
 
         def at(x: Scalar) -> Array:
-            return self.basis.matrix(x, scene.rod.length)
+            return basis_at(scene, self.basis, x)
 
         def with_rate(x: Scalar) -> tuple[Array, Array]:
             return jax.jvp(at, (x,), (jnp.ones_like(x),))
@@ -215,7 +231,7 @@ class Prescribed(SteppedModel):
 
     def _strain(self, scene: Scene, state: Array, X: Float[Array, " stations"]) -> Vector:
         def at(x: Scalar) -> Vector:
-            return c.add(c.split(self.basis.matrix(x, scene.rod.length) @ state), scene.rod.rest(x))
+            return c.add(c.split(basis_at(scene, self.basis, x) @ state), scene.rod.rest(x))
 
         return jax.vmap(at)(X)
 
@@ -289,7 +305,7 @@ def jacobian(
     edges = jnp.minimum(scene.edges(basis.breakpoints(length)), end)
     grid = make_grid(edges, steps, choice("order", order, ORDERS) // 2)
     nodes = grid.X.T.reshape(-1)
-    matrix = jax.vmap(lambda x: basis.matrix(x, length))(nodes)
+    matrix = jax.vmap(lambda x: basis_at(scene, basis, x))(nodes)
     xi = matrix @ q + c.join(scene.sections(nodes).rest)
     shape = grid.X.T.shape
     J = accumulate_jacobian(xi.reshape(*shape, 6), matrix.reshape(*shape, 6, -1), grid.h)

@@ -73,6 +73,22 @@ def _gathered(matrix: Array, wrenches: Vector, grid: Grid) -> Array:
     return jnp.einsum("ijca...,cijb...->ab...", matrix, weighted)
 
 
+def _idle(basis: NodalBasis, problem: ArmProblem) -> Array | None:
+    """1 for coordinates of rigid pieces alone, which stay zero, and 0 for the others, shape (n,
+    *arms); None without rigid pieces."""
+    if problem.sections.flexible is None:
+        return None
+    return jnp.all(basis.matrix == 0, axis=(0, 1, 2)).astype(basis.matrix.dtype)
+
+
+def _regular(K: Array, idle: Array | None) -> Array:
+    """A stiffness matrix (n, n, *arms) with ones for idle coordinates."""
+    if idle is None:
+        return K
+    unit = jnp.eye(K.shape[0], dtype=K.dtype).reshape(*K.shape[:2], *(1,) * (K.ndim - 2))
+    return K + unit * idle
+
+
 def start(q: Array, problem: ArmProblem) -> GalerkinUnknown:
     """Coordinates, and couplings that exert no force."""
     none = without_force(problem.forces)
@@ -114,7 +130,8 @@ def imbalance(
         None if x is None else coupling.residual(x, at, note, problem, ALL)
         for coupling, x, note in zip(problem.couplings, unknown.coupled, at.notes, strict=True)
     )
-    return GalerkinUnknown(_projected(basis.matrix, r, problem.grid), rows)
+    force, idle = _projected(basis.matrix, r, problem.grid), _idle(basis, problem)
+    return GalerkinUnknown(force if idle is None else force + idle * unknown.q, rows)
 
 
 def approximate_tangent(
@@ -137,7 +154,7 @@ def approximate_tangent(
         slopes = slopes_of(at.along, at.loads)
         moved = reaction_change(stack(columns), *beside((at.along, slopes, grid)))
         change = c.subtract(change, components(moved))
-    K = _gathered(matrix, change, grid)
+    K = _regular(_gathered(matrix, change, grid), _idle(basis, problem))
     _, border = borders_of(problem, unknown.coupled, at)
     if border is None:
         return K
@@ -248,7 +265,7 @@ def _solve(basis: NodalBasis, problem: ArmProblem) -> Root:
         jnp.expand_dims(s, s.ndim - behind) * column
         for s, column in zip(stiffness, columns, strict=True)
     )
-    K = _gathered(basis.matrix, strained, problem.grid)
+    K = _regular(_gathered(basis.matrix, strained, problem.grid), _idle(basis, problem))
     sizes = _sizes_of(basis, K, problem)
     size = K.shape[0]
     elastic = c.single(lu.diagonal(K))

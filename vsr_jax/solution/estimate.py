@@ -47,9 +47,8 @@ def error_of(model: Model, scene: Scene, inputs: Array, forces: Vector, state: A
     size = jnp.stack([jnp.max(jnp.abs(x)) for x in found.other])
     least = _ROUNDED * jnp.finfo(moved.dtype).eps
     sections = scene.sections(found.X)
-    slender = scene.rod.length * jnp.sqrt(
-        jnp.max(sections.stiffness[3] / jnp.minimum(sections.stiffness[1], sections.stiffness[2]))
-    )
+    slender = sections.stiffness[3] / jnp.minimum(sections.stiffness[1], sections.stiffness[2])
+    slender = scene.rod.length * jnp.sqrt(jnp.max(c.times(sections.flexible, slender)))
     bend = jnp.array([slender / scene.rod.length] * 3 + [1.0] * 3, size.dtype)
     return Error(
         _SAFETY * moved + least * scene.rod.length * (1 + slender),

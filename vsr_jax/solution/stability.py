@@ -65,6 +65,9 @@ def extreme(scene: Scene, forces: Vector, nodes: Nodes, *, greatest: bool = Fals
     values = jnp.linalg.eigvalsh(
         c.join_matrix(c.symmetric(lower)) / (root[..., :, None] * root[..., None, :])
     )
+    if nodes.sections.flexible is not None:
+        bends = nodes.sections.flexible[..., None] > 0
+        values = jnp.where(bends, values, -jnp.inf if greatest else jnp.inf)
     return jnp.max(values) if greatest else jnp.min(values)
 
 
@@ -157,9 +160,9 @@ class ScaledTangent(Operator):
     r"""Symmetric part of $W^{1/2} \Sigma^{-1/2} (\partial r / \partial \xi) \Sigma^{-1/2} W^{-1/2}$
     with W the weights of the nodes, on arrays of shape (free strains, stages, steps).
 
-    Excluded are changes of strain at nodes of zero weight, from pieces of the arm of zero length,
-    and those that change the path length of a taut cable (`taut`: orthonormal, zero for slack
-    ones).
+    Excluded are changes of strain on rigid pieces and at nodes of zero weight, from pieces of the
+    arm of zero length, and those that change the path length of a taut cable (`taut`: orthonormal,
+    zero for slack ones).
     """
 
     lower: Matrix
@@ -205,6 +208,8 @@ def arm_of(scene: Scene, forces: Vector, nodes: Nodes) -> Arm:
         [jnp.broadcast_to(s, grid.X.shape) for s in free_components(sections.stiffness, free)]
     )
     there = grid.weight > 0
+    if sections.flexible is not None:
+        there &= sections.flexible > 0
     units = jnp.where(there, 1 / jnp.sqrt(jnp.where(there, grid.weight, 1.0) * stiffness), 0.0)
     taut: list[Array] = []
     for place in scene.length_driven:

@@ -48,6 +48,16 @@ def tube_values(
     return np.concatenate([skin, edges[0], edges[-1]])
 
 
+def tube_parts(parts: Bool[np.ndarray, " between"], angles: int) -> Bool[np.ndarray, " triangles"]:
+    """A property of the parts between stations as that of the triangles of a `tube`.
+
+    **Arguments:** `angles`: number of points of each ring of the wall, the last of which is the
+    first one again.
+    """
+    skin = np.repeat(parts, 2 * (angles - 1))
+    return np.concatenate([skin, *(np.repeat(end, angles - 1) for end in parts[[0, -1]])])
+
+
 def bands(mesh: Mesh, level: Int[np.ndarray, " triangles"], count: int) -> list[Mesh]:
     """The parts of a mesh whose triangles have the levels 0 to `count` - 1, each with its own
     vertices."""

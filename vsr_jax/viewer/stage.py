@@ -17,7 +17,7 @@ from ..viz.space import FRAME_COLORS
 from ..viz.style import COLORS, Theme, mixed, settings
 from .coloring import BANDS, COLORINGS, Scale
 from .description import Shape
-from .mesh import ArrowScale, Mesh, bands, discs, polygons, segments, tube, tube_values
+from .mesh import ArrowScale, Mesh, bands, discs, polygons, segments, tube, tube_parts, tube_values
 from .session import Answer
 
 _FRAME = 0.13
@@ -32,8 +32,8 @@ _ANGLE, _DISTANCE, _ASIDE = 0.7, 1.9, 0.25
 """Angle of view [rad]; distance of the camera, and how far the controls at the right move what it
 looks at, in extents of the arm."""
 _OPACITY = {"strain": 0.8, "stress": 0.8, "tension": 0.4}
-_DIMMED, _DISC = 0.15, 0.25
-"""Opacity of the wall of a shape that is no equilibrium, and of discs."""
+_DIMMED, _DISC, _RIGID = 0.15, 0.25, 0.9
+"""Opacity of the wall of a shape that is no equilibrium, of discs, and of rigid pieces."""
 _THREAD = 4.0
 """Width of threads [pixels]."""
 _THIN, _WITHIN = 0.012, 0.5
@@ -97,17 +97,20 @@ class Stage:
         self.drawn += 1
 
     def _draw_wall(self, shape: Shape, good: bool) -> None:
-        wall = tube(np.asarray(shape.body.widened(self.widening).samples.wall))
+        rings = np.asarray(shape.body.widened(self.widening).samples.wall)
+        rigid = tube_parts(shape.body.rigid, rings.shape[1])
+        wall, held = bands(tube(rings), rigid.astype(int), 2)
         values = self.scale.coloring.values(shape)
         self.scale.cover(values)
         plain = not good or self.scale.coloring is COLORINGS["tension"]
         opacity = _OPACITY[_name(self.scale)] if good else _DIMMED
+        self._mesh("/arm/wall/rigid", held, self._gray(0.75), _RIGID if good else _DIMMED)
         if plain:
             self._mesh("/arm/wall/plain", wall, self._gray(0.5), opacity)
             parts = [Mesh(wall.vertices[:0], wall.triangles[:0])] * BANDS
         else:
             self._hide("/arm/wall/plain")
-            level = self.scale.levels(tube_values(values))
+            level = self.scale.levels(tube_values(values)[~rigid])
             parts = bands(wall, level, BANDS)
         for i, (part, color) in enumerate(zip(parts, self.scale.colors(), strict=True)):
             self._mesh(f"/arm/wall/{i}", part, color, opacity)

@@ -1,16 +1,19 @@
 """One arm in space: its shape at stations, its tensions, its discs, and how they are drawn; also of
 an arm whose solve failed."""
 
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 from matplotlib.typing import ColorType
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 
+from ..arm.rod import Rod
 from ..arm.scene import Scene
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
@@ -21,6 +24,9 @@ from .tendons import TensionScale, draw_threads, is_slack
 
 _DISCS = 13
 _ANGLES = np.linspace(0.0, 2 * np.pi, 33)
+
+_WALL, _RIGID_WALL = 0.18, 0.5
+"""Opacity of the wall, and of that of rigid pieces."""
 
 _THIN, _DRAWN = 0.01, 0.03
 """Radius of an arm relative to its extent below which its section is drawn wider, and how wide."""
@@ -44,13 +50,15 @@ def sample(eq: Equilibrium, stations: VectorLike = 60) -> Summary:
 
 class Body(NamedTuple):
     """An arm as it is drawn: its `samples`; the `tension` of its threads [N] and which are
-    `slack`, None where they are not known; its `discs` [m], shape (discs, angles, 3); the
-    `failure` of the solve, in which case the shape is that at rest."""
+    `slack`, None where they are not known; its `discs` [m], shape (discs, angles, 3); whether it is
+    `rigid` between each station and the next, shape (stations - 1,); the `failure` of the solve, in
+    which case the shape is that at rest."""
 
     samples: Summary
     tension: np.ndarray | None
     slack: np.ndarray | None
     discs: np.ndarray
+    rigid: np.ndarray
     failure: str | None = None
 
     def widened(self, factor: float) -> "Body":
@@ -61,6 +69,14 @@ class Body(NamedTuple):
         middle = self.discs.mean(axis=1, keepdims=True)
         samples = eqx.tree_at(lambda s: (s.wall, s.threads), self.samples, (wall, threads))
         return self._replace(samples=samples, discs=middle + factor * (self.discs - middle))
+
+    @property
+    def parts(self) -> list[tuple[slice, bool]]:
+        """Stations of each part that bends and of each that is rigid, in order, and whether it is
+        rigid."""
+        jumps = np.flatnonzero(np.diff(self.rigid)) + 1
+        edges = pairwise([0, *jumps.tolist(), self.rigid.size])
+        return [(slice(a, b + 1), bool(np.any(self.rigid[a:b]))) for a, b in edges]
 
     @property
     def points(self) -> np.ndarray:
@@ -86,16 +102,27 @@ def body_of(eq: Equilibrium | Summary, stations: VectorLike = 60) -> Body:
     **Raises:** `ValueError` as `sample`, except for a solve that failed.
     """
     if isinstance(eq, Summary):
-        return Body(eq, None, None, np.zeros((0, 1, 3)))
+        return Body(eq, None, None, np.zeros((0, 1, 3)), np.zeros(len(eq.X) - 1, bool))
     if np.ndim(eq.status) == 0 and not bool(eq.converged):
         return body_of(at_rest(eq), stations)._replace(failure=eq.message)
+    if eq.scene.rod.rigid and np.ndim(eq.status) == 0:
+        stations = with_rigid_ends(eq.scene.rod, checked_stations(eq, stations, "stations"))
     return body_from_samples(eq, sample(eq, stations))
+
+
+def with_rigid_ends(rod: Rod, X: Float[Array, " stations"]) -> Float[Array, " more"]:
+    """Ascending stations [m] and between them the ends of rigid pieces."""
+    ends = [jnp.clip(x, X[0], X[-1]) for piece in rod.rigid for x in piece.breakpoints]
+    return jnp.sort(jnp.concatenate([X, jnp.stack(ends)])) if ends else X
 
 
 def body_from_samples(eq: Equilibrium, samples: Summary) -> Body:
     """The arm of a converged equilibrium from its `samples`, as `sample` returns them."""
     tension = -np.asarray(samples.values["forces"])
-    return Body(samples, tension, is_slack(eq, tension), _discs(eq, samples))
+    between = jnp.asarray(samples.X[1:] + samples.X[:-1]) / 2
+    flexible = eq.scene.rod.flexible(between)
+    rigid = np.zeros(between.shape, bool) if flexible is None else np.asarray(flexible) == 0
+    return Body(samples, tension, is_slack(eq, tension), _discs(eq, samples), rigid)
 
 
 def at_rest(eq: Equilibrium) -> Equilibrium:
@@ -134,9 +161,11 @@ def draw_body(
         color, scale = ink(0.45), None
         line = {**line, "linestyle": "--"}
     if surface:
-        x, y, z = np.moveaxis(np.asarray(body.samples.wall), -1, 0)
         options = {"linewidth": 0, "rstride": 1, "cstride": 1, "rasterized": True}
-        ax.plot_surface(x, y, z, color=color, alpha=0.18, **options)
+        for stations, rigid in body.parts:
+            x, y, z = np.moveaxis(np.asarray(body.samples.wall)[stations], -1, 0)
+            shown, alpha = (shade(color), _RIGID_WALL) if rigid else (color, _WALL)
+            ax.plot_surface(x, y, z, color=shown, alpha=alpha, **options)
         if len(body.discs):
             rims = Poly3DCollection(body.discs, facecolors=[color], edgecolors=[color], alpha=0.2)
             ax.add_collection3d(rims, autolim=False)

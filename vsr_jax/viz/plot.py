@@ -88,7 +88,7 @@ def arm(
     **line: Any,
 ) -> Axes3D:
     """The deformed arm in 3D: its axis, its translucent outer wall or its discs, and its threads,
-    at equal scale.
+    at equal scale. The wall of rigid pieces is darker and more opaque.
 
     With details, threads have the colour of their tension, with a colour bar (blue pushes,
     vermilion pulls), and are dashed where they are slack; loads are arrows with a legend; obstacles
