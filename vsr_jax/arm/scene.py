@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 from ..numerics.component import Forces, Vector, Wrench, add, dot
 from ..numerics.quadrature import make_grid, piece_edges
 from ..typing import ArrayLike, DTypeLike, Scalar, VectorLike, cast
-from ..validation import instance, instances, is_traced, numbers, precise
+from ..validation import concrete, instance, instances, is_traced, numbers, precise
 from .actuator import Actuator
 from .description import Part, describe, described_arguments, table
 from .held import Held

@@ -162,12 +162,12 @@ class Holds(Coupling):
         return Border(tuple(act * part for part in wrenches), wrenches, self._stiff, soft)
 
     def sizes(self, x: Array, at: ArmState, problem: ArmProblem) -> list[Array]:
-        length, stiffness, sizes = problem.length, problem.sections.stiffness, []
+        length, sizes = problem.length, []
         for hold, part in zip(self.holds, self._parts(x), strict=True):
             wrench = hold.wrench(part)[:, None, None]
             moment = rows_of(wrench, 0, 3) + length * rows_of(wrench, 3, 6)
             whole = (*components(moment), *components(rows_of(wrench, 3, 6)))
-            sizes.append(shape_of(whole, stiffness, length))
+            sizes.append(shape_of(whole, problem.sections, length))
         return sizes
 
     def row_sizes(self, rows: Array, at: ArmState, problem: ArmProblem) -> list[Array]:
