@@ -10,17 +10,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..numerics.component import Forces, Vector, Wrench, add, dot
-from ..numerics.quadrature import make_grid, piece_edges
+from ..numerics.component import Forces, Vector, Wrench, add
+from ..numerics.quadrature import piece_edges
 from ..typing import ArrayLike, DTypeLike, Scalar, VectorLike, cast
 from ..validation import ROUNDING, concrete, instance, is_traced, numbers, precise
 from .actuator import Actuator
 from .description import Part, describe, described_arguments, table
+from .discs import check_discs, inner_discs, rest_length
 from .loads import Frame, Load
 from .pose_loads import PoseLoad
 from .profile import Limits
 from .rod import STRAINS, Rod
-from .routing import Path, thread_tangent
+from .routing import Path
 from .scene_numbers import checked_values, replaced
 
 
@@ -137,10 +138,20 @@ class Scene(Part):
         return tuple(i for i, actuator in enumerate(self.actuators) if actuator.frictional)
 
     @property
+    def straight(self) -> tuple[int, ...]:
+        """Indices of the actuators that run straight from disc to disc."""
+        return tuple(i for i, actuator in enumerate(self.actuators) if actuator.straight)
+
+    @property
+    def reacts(self) -> bool:
+        """Whether sections bear wrenches from beyond them, of loads or of straight tendons."""
+        return bool(self.loads or self.straight)
+
+    @property
     def coupled(self) -> bool:
-        """Whether the cross-sections depend on each other: through loads, given thread lengths or
-        friction."""
-        return bool(self.loads or self.length_driven or self.frictional)
+        """Whether the cross-sections depend on each other: through loads, straight tendons, given
+        thread lengths or friction."""
+        return bool(self.reacts or self.length_driven or self.frictional)
 
     @property
     def breakpoints(self) -> tuple[Scalar, ...]:
@@ -149,6 +160,7 @@ class Scene(Part):
         return (
             *self.rod.breakpoints,
             *laid,
+            *inner_discs(self.rod, self.actuators),
             *(x for load in self.loads for x in load.breakpoints(self.rod)),
         )
 
@@ -256,7 +268,7 @@ class Scene(Part):
 
     def rest_length(self, place: int) -> Scalar:
         """Length of a thread's path at rest [m]."""
-        return _rest_length(self, place)
+        return rest_length(self.rod, self.actuators[place])
 
     def replace(
         self,
@@ -337,6 +349,8 @@ class Scene(Part):
                         f"Scene.actuators[{i}].{name}: got {float(x):g} m, need a place on the "
                         f"arm of {length:g} m"
                     )
+            if actuator.straight:
+                check_discs(f"Scene.actuators[{i}]", actuator, self.rod.length)
         for i, load in enumerate(self.loads):
             X = load.place(self.rod)
             if X is not None and float(X) > beyond:
@@ -354,14 +368,6 @@ def _line(part: Any) -> str:
 def _each(name: str, values: Any, kind: type, needed: str) -> tuple:
     values = (values,) if isinstance(values, kind) else values
     return tuple(instance(f"{name}[{i}]", value, kind, needed) for i, value in enumerate(values))
-
-
-@eqx.filter_jit
-def _rest_length(scene: Scene, place: int) -> Scalar:
-    grid = make_grid(scene.edges(), 32, 3)
-    sections = scene.sections(grid.X)
-    t_c, reach = thread_tangent(sections.rest, sections.paths[place]), sections.reach[place]
-    return jnp.sum(grid.weight * jnp.sqrt(dot(t_c, t_c)) * (1.0 if reach is None else reach))
 
 
 _PROBES = 65

@@ -72,8 +72,8 @@ def state_of(xi: Vector, coupled: tuple[PyTree, ...], problem: ArmProblem) -> Ar
     grid, couplings = problem.grid, problem.couplings
     forces = forces_at(couplings, coupled, problem.forces)
     carried = _carried(xi, coupled, problem, forces)
-    along = None if problem.loads is None else react(xi, grid, problem.loads)
-    at = ArmState(xi, carried, shared(forces, carried.shares), along, ())
+    along = None if problem.loads is None else react(xi, grid, problem.loads, forces)
+    at = ArmState(xi, carried, problem.along_sections(shared(forces, carried.shares)), along, ())
     pairs = zip(couplings, coupled, strict=True)
     return at._replace(notes=tuple(coupling.note(x, at, problem) for coupling, x in pairs))
 
@@ -88,9 +88,9 @@ def _carried(
 
 
 def carried_forces(unknown: ArmUnknown, problem: ArmProblem) -> Forces:
-    """Force of each thread at the nodes."""
+    """Force of each thread along the nodes."""
     forces = forces_at(problem.couplings, unknown.coupled, problem.forces)
-    return shared(forces, _carried(*unknown, problem, forces).shares)
+    return problem.along_sections(shared(forces, _carried(*unknown, problem, forces).shares))
 
 
 def imbalance_of(

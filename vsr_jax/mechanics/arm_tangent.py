@@ -21,6 +21,7 @@ from .elimination_nodes import Definiteness
 from .pose_elimination import eliminate_poses
 from .reaction import slopes_of
 from .sizes import node_weight
+from .springs import with_springs
 
 _REFINEMENTS = 60
 """Bound on the refinement steps of a tangent system; 5 to 10 are usual."""
@@ -64,6 +65,9 @@ def approximate_solve(
             return eliminate_poses(lower, b, unknown.xi, along, slopes, grid, free)
         return eliminate(lower, b, along, slopes, grid, free)
 
+    if along is not None and along.pull is not None:
+        springs = along.pull.springs(along.rotation)
+        solve = with_springs(solve, springs, grid)
     strain, (negative, doubtful) = solve(spread(right.wrench, free))
     places, border = borders_of(problem, unknown.coupled, at)
     if border is None:

@@ -19,7 +19,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ..arm.scene import Scene
-from ..numerics.component import Vector
+from ..numerics.component import Forces, Vector
 from ..numerics.magnus import magnus_6
 from ..numerics.quadrature import (
     Grid,
@@ -46,6 +46,7 @@ from ..numerics.stacked import (
     transpose,
     turned,
 )
+from .chords import Discs, Pull, discs_of, pull_of
 from .pose_terms import PoseTerm, finite, pose_terms
 
 
@@ -67,6 +68,7 @@ class Loading(NamedTuple):
     - `follower_density`: $(c, f)$ in the body frame; `follower_points`: wrenches at points in the
       body frame;
     - `by_pose`: loads that depend on the pose of their section;
+    - `discs`: tendons that run straight from disc to disc;
     - `base`: pose of the base, the identity for None.
     """
 
@@ -75,6 +77,7 @@ class Loading(NamedTuple):
     follower_density: Array | None
     follower_points: tuple[FollowerPoint, ...]
     by_pose: tuple[PoseTerm, ...]
+    discs: Discs | None
     base: Array | None
 
     @property
@@ -83,8 +86,8 @@ class Loading(NamedTuple):
         loads, 3 (rotation) or 6 (and displacement)."""
         if any(term.load.needs == "pose" for term in self.by_pose):
             return 6
-        turns = self.by_pose or self.follower_points or self.follower_density is not None
-        return 3 if turns else 0
+        turns = self.by_pose or self.follower_points
+        return 3 if turns or self.follower_density is not None or self.discs is not None else 0
 
     def scaled(self, share: Array) -> "Loading":
         """A fraction of all loads."""
@@ -124,6 +127,7 @@ class Reaction(NamedTuple):
       points (6,) and the follower density.
     - `body_density`: density (c, f) of all loads in the body frame.
     - `seen`: rotation and position where each load acts that depends on the pose.
+    - `pull`: the chords of straight tendons, whose wrenches are parts of `world` and `wrench`.
     """
 
     starts: Array
@@ -136,6 +140,7 @@ class Reaction(NamedTuple):
     follower: Array | None
     body_density: Array
     seen: tuple[tuple[Array, Array | None], ...]
+    pull: Pull | None
 
 
 class PointSlope(NamedTuple):
@@ -149,21 +154,24 @@ class PointSlope(NamedTuple):
 
 class Slopes(NamedTuple):
     """Derivatives of the loads in the world frame with respect to motions of their sections: of the
-    density (6, motion, stages, steps), None if it is constant, and of the wrenches at points."""
+    density (6, motion, stages, steps), None if it is constant, of the wrenches at points, and of
+    those of chords at the ends of the steps (6, motion, steps)."""
 
     density: Array | None
     points: tuple[PointSlope, ...]
+    ends: Array | None
 
     @property
     def motion(self) -> int:
         """Size of the motions, see `Loading.motion`."""
-        matrices = [x for x in (self.density, *(p.matrix for p in self.points)) if x is not None]
+        every = (self.density, self.ends, *(p.matrix for p in self.points))
+        matrices = [x for x in every if x is not None]
         return matrices[0].shape[1] if matrices else 0
 
 
 def loading(scene: Scene, grid: Grid) -> Loading | None:
-    """The loads of a scene on a grid; None if it has none."""
-    if not scene.loads:
+    """The loads and straight tendons of a scene on a grid; None if it has none."""
+    if not scene.reacts:
         return None
     dead_density, follower_density = (scene.density(grid.X, frame) for frame in ("world", "body"))
     density = None if dead_density is None else stack(dead_density)
@@ -176,7 +184,8 @@ def loading(scene: Scene, grid: Grid) -> Loading | None:
         FollowerPoint(*before_point(grid, X), stack(wrench))
         for X, wrench in scene.point_wrenches("body")
     )
-    return Loading(dead, density, follower, points, pose_terms(scene, grid), scene.rod.base)
+    by_pose, discs = pose_terms(scene, grid), discs_of(scene, grid)
+    return Loading(dead, density, follower, points, by_pose, discs, scene.rod.base)
 
 
 def partial_rotation(k: Array, h: Array, sigma: Array | float) -> Array:
@@ -225,9 +234,9 @@ def rotations(k: Array, h: Array, base: Array | None) -> tuple[Array, Array, Arr
     return starts, matmul(starts[:, :, None], within_step[:, :, :-1]), end
 
 
-def react(xi: Vector, grid: Grid, loads: Loading) -> Reaction:
+def react(xi: Vector, grid: Grid, loads: Loading, forces: Forces = ()) -> Reaction:
     """Reaction at the nodes for the strain `xi`, six component arrays of shape (stages, steps,
-    *arms)."""
+    *arms), and for the `forces` of the threads at their start."""
     whole = stack(xi)
     starts, R, end = rotations(rows(whole, 0, 3), grid.h, loads.base)
     zero, back = jnp.zeros_like(whole), transpose(R)
@@ -256,8 +265,16 @@ def react(xi: Vector, grid: Grid, loads: Loading) -> Reaction:
             world = world + term.before * here[:, None, None]
     arm = cross(axis, rows(world, 3, 6))
     world, density = _with_moment(world, beyond(arm, grid)), _with_moment(density, arm)
+    pull = None
+    if loads.discs is not None:
+        pull = pull_of(loads.discs, starts, end, axis, grid, forces)
+        chords = pull.wrench
+        world = world + chords
+        density = _with_moment(density, cross(axis, rows(chords, 3, 6)))
     wrench = turned(back, world)
-    return Reaction(starts, R, world, density, wrench, axis, points, follower, body_density, seen)
+    return Reaction(
+        starts, R, world, density, wrench, axis, points, follower, body_density, seen, pull
+    )
 
 
 def _seen(
@@ -295,7 +312,8 @@ def slopes_of(along: Reaction, loads: Loading) -> Slopes:
             points.append(PointSlope(term.step, term.before, here))
         else:
             density = here if density is None else density + here
-    return Slopes(density, tuple(points))
+    ends = None if along.pull is None else along.pull.slopes(size)
+    return Slopes(density, tuple(points), ends)
 
 
 def _turning(wrench: Array, size: int) -> Array:
@@ -344,10 +362,12 @@ def reaction_change(change: Array, along: Reaction, slopes: Slopes, grid: Grid) 
     return turned(transpose(R), jnp.concatenate([dm, rows(delta, 3, 6) - cross(theta, n)]))
 
 
-def react_at(xi: Vector, grid: Grid, loads: Loading, X: Array) -> Vector:
+def react_at(
+    xi: Vector, grid: Grid, loads: Loading, X: Array, forces: Forces = ()
+) -> Vector:
     r"""Reaction $\Lambda$ at abscissas X, six component arrays of their shape, from the strain at
-    the nodes."""
-    along = react(xi, grid, loads)
+    the nodes and the `forces` of the threads at their start."""
+    along = react(xi, grid, loads, forces)
     step, sigma = locate(grid, X)
     k = stack(xi[:3])[:, :, step]
     turn = stacked_rotation(partial_rotation(k, grid.h[step], sigma))
