@@ -45,12 +45,16 @@ def approximate_solve(
     has the tangent 1), whether it is definite for the changes of shape that the couplings allow,
     and whether that is doubtful.
 
-    In single precision throughout: the passes along the arm are bound by memory, and rounding is
-    far below the error of the elimination.
+    In single precision: the passes along the arm are bound by memory, and rounding is far below the
+    error of the elimination. Only chords under loads keep the precision of the unknowns: part of
+    the elimination are dead forces as large as theirs, under which an arm alone is close to failure
+    again and again.
     """
-    unknown, at, right, problem, damping = c.single(
-        (unknown, at, right, problem, jnp.asarray(damping))
-    )
+    loads = problem.loads
+    if loads is None or loads.discs is None or loads.absent_but_discs:
+        unknown, at, right, problem, damping = c.single(
+            (unknown, at, right, problem, jnp.asarray(damping))
+        )
     sections, grid = problem.sections, problem.grid
     lower = tangent(unknown.xi, sections, at.tau)
     lower = tuple(
@@ -59,14 +63,16 @@ def approximate_solve(
 
     along, loads = at.along, problem.loads
     slopes = None if along is None or loads is None else slopes_of(along, loads)
+    if slopes is not None and along.pull is not None and loads.absent_but_discs:
+        slopes = slopes._replace(ends=along.pull.cut(slopes.ends), joined=along.pull.joined)
 
     def solve(b: Vector) -> tuple[Vector, Definiteness]:
         if along is not None and slopes is not None and slopes.motion == 6:
             return eliminate_poses(lower, b, unknown.xi, along, slopes, grid, free)
         return eliminate(lower, b, along, slopes, grid, free)
 
-    if along is not None and along.pull is not None:
-        springs = along.pull.springs(along.rotation)
+    if along is not None and loads is not None and along.pull is not None:
+        springs = along.pull.springs(along.rotation, cut=loads.absent_but_discs)
         solve = with_springs(solve, springs, grid)
     strain, (negative, doubtful) = solve(spread(right.wrench, free))
     places, border = borders_of(problem, unknown.coupled, at)

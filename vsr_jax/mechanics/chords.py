@@ -111,10 +111,16 @@ class Pull(NamedTuple):
         over = before[first + 1] - before[first]
         return over[:, None] * jnp.concatenate([cross(self.chords.lever, force), force])
 
-    def across(self, force: Array) -> Array:
+    def across(self, force: Array, cut: bool) -> Array:
         """Wrenches chord by chord of forces (3, chords) in any direction, with the moments
-        $(p_{i+1} - p_i) \\times f_i$ of both ends of a chord on the sections before it."""
-        before = self.discs.before[self.discs.first + 1]
+        $(p_{i+1} - p_i) \\times f_i$ of both ends of a chord on the sections before it; where the
+        arm is `cut`, only on those of the same piece."""
+        first = self.discs.first
+        before = self.discs.before[first + 1]
+        if cut:
+            piece = jnp.cumsum(jnp.concatenate([jnp.zeros_like(self.joined[:1]), 1.0 - self.joined[:-1]]), axis=0)
+            own = jnp.sum(self.discs.at[first, :-1] * piece, axis=1)
+            before = before * (piece == own[:, None])
         moment = cross(self.chords.length * self.chords.direction, force)
         moment = before[:, None] * moment[:, :, None, None]
         return self._each(force) + jnp.concatenate([moment, jnp.zeros_like(moment)])
@@ -132,7 +138,24 @@ class Pull(NamedTuple):
         """Whether each chord belongs to the tendon at a place among the threads."""
         return self.discs.owner == self.discs.places.index(place)
 
-    def springs(self, rotation: Array) -> Vector:
+    @property
+    def joined(self) -> Array:
+        """1 for each step over whose end a chord passes, shape (steps,): at all other ends the arm
+        can be cut, without loads."""
+        first, before = self.discs.first, self.discs.before
+        over = before[first + 1] - before[first]
+        after = jnp.concatenate([over[:, 1:], jnp.zeros_like(over[:, :1])], axis=1)
+        return jnp.max(over * after, axis=0)
+
+    def cut(self, slopes: Array) -> Array:
+        """`slopes` of an arm that is cut where no chord passes: there only the chords before the
+        cut act at their holes."""
+        joined = self.joined
+        first = self.discs.first
+        incoming = jnp.zeros_like(self.chords.arms).at[:, first + 1].add(self.force)
+        return joined * slopes + (1.0 - joined) * self._at_steps(incoming, slopes.shape[1])
+
+    def springs(self, rotation: Array, *, cut: bool) -> Vector:
         r"""Wrenches $w_j$ on the nodes, in their frames, for which the turning of the chords adds
         $\sum_j w_j w_j^T$ to the tangent: component arrays (2 chords, stages, steps)."""
         e = self.chords.direction
@@ -143,7 +166,7 @@ class Pull(NamedTuple):
         root = jnp.sqrt(self.stiffness)
         both = []
         for unit in (across, cross(e, across)):
-            both.append(turned(transpose(rotation)[:, :, None], self.across(root * unit)))
+            both.append(turned(transpose(rotation)[:, :, None], self.across(root * unit, cut)))
         return components(jnp.concatenate(both, axis=1))
 
     @property
@@ -165,8 +188,14 @@ class Pull(NamedTuple):
         r"""Derivatives (6, motion, steps) of the wrenches at the ends of the steps by the rotations
         there: a force F at a hole q beside the axis has the moment $q \times F$, which changes by
         $(q F^T - q \cdot F) \theta$."""
-        first, q = self.discs.first, self.chords.arms
-        F = jnp.zeros_like(q).at[:, first + 1].add(self.force).at[:, first].add(-self.force)
+        first = self.discs.first
+        at_holes = jnp.zeros_like(self.chords.arms)
+        at_holes = at_holes.at[:, first + 1].add(self.force).at[:, first].add(-self.force)
+        return self._at_steps(at_holes, motion)
+
+    def _at_steps(self, F: Array, motion: int) -> Array:
+        """`slopes` for forces (3, holes) in the holes."""
+        q = self.chords.arms
         at_holes = q[:, None] * F[None]
         at_holes = at_holes - dot(q, F) * identity(at_holes)
         at_steps = jnp.sum(self.discs.at[:, 1:] * at_holes[:, :, :, None], axis=2)

@@ -56,7 +56,8 @@ class StepNodes(NamedTuple):
     the wrench (6) and its density (6); the derivatives (6, 3) of the load density at the nodes and
     of the loads at the end of the step by rotations, None where there are none.
 
-    Behind the components come the axis of the nodes (but for h and `jump`) and those of steps or
+    Behind the components come the axis of the nodes (but for h, `jump` and
+    `joined`) and those of steps or
     arms.
     """
 
@@ -71,6 +72,7 @@ class StepNodes(NamedTuple):
     density: Array
     slope: Array | None
     jump: Array | None
+    joined: Array | None
 
 
 class Sections(NamedTuple):
@@ -96,6 +98,7 @@ class Condensed(NamedTuple):
     - `turn` (3, columns), `turned`: rotation at the end.
     - `start` (wrench, columns), `started`: change of the wrench at the start.
     - `jump` (6, 3): derivative of the loads at the end by their rotation, None without such loads.
+    - `joined`: 0 where the arm is cut at the end, 1 where it is not; None without cuts.
     - `moment`, `compliance`: the moment at the start and the compliance of the first node.
     """
 
@@ -106,6 +109,7 @@ class Condensed(NamedTuple):
     turned: Array
     started: Array
     jump: Array | None
+    joined: Array | None
     moment: Array
     compliance: Array
 
@@ -173,10 +177,11 @@ def eliminate(
         strain = _by_start(nodes, sections, step, _moved(joint, 0, last))
 
     def forward(theta: Array, step: tuple) -> tuple[Array, Array]:
-        turn, more = jax.tree.map(once, step)
-        return matvec(turn, theta) + more, theta
+        turn, more, joined = jax.tree.map(once, step)
+        return c.times(joined, matvec(turn, theta) + more), theta
 
-    _, theta = lax.scan(forward, nothing[:3, 0], (turn, turned_end))
+    joined = _moved(nodes.joined, last, 0)
+    _, theta = lax.scan(forward, nothing[:3, 0], (turn, turned_end, joined))
     by_theta, constant = strain
     found = matvec(by_theta, jnp.moveaxis(theta, 0, last)[:, None]) + constant
     found = turned(transpose(nodes.rotation), found)
@@ -213,6 +218,7 @@ def _nodes(H: Matrix, right: Vector, along: Reaction, slopes: Slopes, grid: Grid
         whole(along.density),
         None if slopes.density is None else whole(slopes.density),
         None if jump is None else jnp.broadcast_to(jump, (*jump.shape[:2], *shape[1:])),
+        None if slopes.joined is None else jnp.broadcast_to(slopes.joined, shape[1:]),
     )
 
 
@@ -224,13 +230,16 @@ def _apart(nodes: StepNodes, grid: Grid) -> StepNodes:
         shape = (*x.shape[:place], 1, stages * steps, *x.shape[place + 2 :])
         return x.swapaxes(place, place + 1).reshape(shape)
 
-    apart = nodes._replace(h=None, jump=None)
+    apart = nodes._replace(h=None, jump=None, joined=None)
     apart = jax.tree.map(lambda x: own(x, x.ndim - nodes.axis.ndim + 1), apart)
     jump = nodes.jump
     if jump is not None:
         jump = own(at_last_nodes(jump, stages), 2)[:, :, 0]
+    joined = nodes.joined
+    if joined is not None:
+        joined = own(1.0 - at_last_nodes((1.0 - joined)[None, None], stages), 2)[0, 0, 0]
     h = own(jnp.broadcast_to(grid.weight, nodes.axis.shape[1:]), 0)[0]
-    return apart._replace(h=h, jump=jump)
+    return apart._replace(h=h, jump=jump, joined=joined)
 
 
 def _moved(tree: Tree, source: int, destination: int) -> Tree:
@@ -280,6 +289,7 @@ def _condensed(node: StepNodes, free: tuple[int, ...]) -> tuple[Sections, Conden
         h * weighted(weights, bent, 1),
         started,
         node.jump,
+        node.joined,
         node.wrench[:3, 0] + before,
         sections.compliance[:, :, 0],
     )
@@ -381,6 +391,8 @@ def _joined(end: tuple[Array, Array], step: Condensed) -> tuple[tuple, tuple[Joi
     pivots and the asymmetry."""
     step = jax.tree.map(once, step)  # fused with a use of theirs, slices of the scan are slow
     P, p = end
+    if step.joined is not None:
+        P, p = step.joined * P, step.joined * p
     if step.jump is not None:
         P = P + step.jump
     by_end = columns(step.turn, 3, step.turn.shape[1])

@@ -81,6 +81,12 @@ class Loading(NamedTuple):
     base: Array | None
 
     @property
+    def absent_but_discs(self) -> bool:
+        """Whether there are no loads, only straight tendons."""
+        dead = self.dead is None and self.follower_density is None
+        return dead and not (self.follower_points or self.by_pose)
+
+    @property
     def motion(self) -> int:
         """Size of the motions of sections by which wrenches in the world frame change: 0 for dead
         loads, 3 (rotation) or 6 (and displacement)."""
@@ -155,11 +161,15 @@ class PointSlope(NamedTuple):
 class Slopes(NamedTuple):
     """Derivatives of the loads in the world frame with respect to motions of their sections: of the
     density (6, motion, stages, steps), None if it is constant, of the wrenches at points, and of
-    those of chords at the ends of the steps (6, motion, steps)."""
+    those of chords at the ends of the steps (6, motion, steps).
+
+    `joined`: 0 for each step at whose end the arm can be cut, since the wrenches on each side
+    depend on the motions of that side relative to the cut; None without cuts."""
 
     density: Array | None
     points: tuple[PointSlope, ...]
     ends: Array | None
+    joined: Array | None = None
 
     @property
     def motion(self) -> int:
