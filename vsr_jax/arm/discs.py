@@ -63,13 +63,20 @@ def rest_length(rod: Rod, actuator: Actuator) -> Scalar:
         here = (X >= holes[0]) & (X < holes[1])
         return jnp.sum(grid.weight.reshape(-1) * jnp.where(here, jnp.sqrt(dot(t_c, t_c)), 0.0))
     poses = step_poses(tuple(x.reshape(grid.X.shape) for x in rest), grid.h)
-    points = hole_points(actuator, holes, poses[steps_before(grid, holes)])
+    points = points_at(actuator, holes, poses[steps_before(grid, holes)])
     return jnp.sum(jnp.linalg.norm(jnp.diff(points, axis=0), axis=1))
 
 
-def hole_points(
-    actuator: Actuator, X: Float[Array, " holes"], poses: Float[Array, "holes 4 4"]
-) -> Float[Array, "holes 3"]:
+def points_at(
+    actuator: Actuator, X: Float[Array, " places"], poses: Float[Array, "places 4 4"]
+) -> Float[Array, "places 3"]:
     """Points [m] where a thread crosses sections at abscissas X with given poses."""
     y, z = jax.vmap(actuator.routing)(X)
     return poses[:, :3, 3] + poses[:, :3, 1] * y[:, None] + poses[:, :3, 2] * z[:, None]
+
+
+def on_chords(
+    points: Float[Array, "holes 3"], holes: Float[Array, " holes"], X: Float[Array, " stations"]
+) -> Float[Array, "stations 3"]:
+    """Points [m] of the chords between holes at abscissas X, in proportion."""
+    return jax.vmap(lambda x: jnp.interp(X, holes, x), in_axes=1, out_axes=1)(points)

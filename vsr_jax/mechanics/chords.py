@@ -111,7 +111,7 @@ class Pull(NamedTuple):
         over = before[first + 1] - before[first]
         return over[:, None] * jnp.concatenate([cross(self.chords.lever, force), force])
 
-    def across(self, force: Array, cut: bool) -> Array:
+    def across(self, force: Array, *, cut: bool) -> Array:
         """Wrenches chord by chord of forces (3, chords) in any direction, with the moments
         $(p_{i+1} - p_i) \\times f_i$ of both ends of a chord on the sections before it; where the
         arm is `cut`, only on those of the same piece."""
@@ -166,7 +166,7 @@ class Pull(NamedTuple):
         root = jnp.sqrt(self.stiffness)
         both = []
         for unit in (across, cross(e, across)):
-            both.append(turned(transpose(rotation)[:, :, None], self.across(root * unit, cut)))
+            both.append(turned(transpose(rotation)[:, :, None], self.across(root * unit, cut=cut)))
         return components(jnp.concatenate(both, axis=1))
 
     @property
