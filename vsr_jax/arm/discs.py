@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..numerics.component import dot
+from ..numerics.component import dot, times
 from ..numerics.magnus import step_poses
 from ..numerics.quadrature import Grid, make_grid, piece_edges
 from ..typing import Scalar
@@ -60,8 +60,8 @@ def rest_length(rod: Rod, actuator: Actuator) -> Scalar:
     rest = jax.vmap(rod.rest)(X)
     if not actuator.straight:
         t_c = thread_tangent(rest, jax.vmap(actuator.routing.path)(X))
-        here = (X >= holes[0]) & (X < holes[1])
-        return jnp.sum(grid.weight.reshape(-1) * jnp.where(here, jnp.sqrt(dot(t_c, t_c)), 0.0))
+        per_length, reach = jnp.sqrt(dot(t_c, t_c)), jax.vmap(actuator.reach)(X)
+        return jnp.sum(grid.weight.reshape(-1) * times(reach, per_length))
     poses = step_poses(tuple(x.reshape(grid.X.shape) for x in rest), grid.h)
     points = points_at(actuator, holes, poses[steps_before(grid, holes)])
     return jnp.sum(jnp.linalg.norm(jnp.diff(points, axis=0), axis=1))

@@ -46,9 +46,9 @@ def approximate_solve(
     and whether that is doubtful.
 
     In single precision: the passes along the arm are bound by memory, and rounding is far below the
-    error of the elimination. Only chords under loads keep the precision of the unknowns: part of
-    the elimination are dead forces as large as theirs, under which an arm alone is close to failure
-    again and again.
+    error of the elimination. Straight tendons of an arm with loads keep the precision of the
+    unknowns: their forces without their turning, which the elimination takes first, are large
+    enough to make its pivots singular.
     """
     loads = problem.loads
     if loads is None or loads.discs is None or loads.absent_but_discs:
@@ -62,17 +62,20 @@ def approximate_solve(
     )
 
     along, loads = at.along, problem.loads
-    slopes = None if along is None or loads is None else slopes_of(along, loads)
-    if slopes is not None and along.pull is not None and loads.absent_but_discs:
-        slopes = slopes._replace(ends=along.pull.cut(slopes.ends), joined=along.pull.joined)
+    if along is None or loads is None:
+        slopes = pull = None
+    else:
+        slopes, pull = slopes_of(along, loads), along.pull
+        if pull is not None and loads.absent_but_discs:
+            slopes = slopes._replace(ends=pull.cut_slopes(slopes.motion), joined=pull.joined)
 
-    def solve(b: Vector) -> tuple[Vector, Definiteness]:
+    def solve(b: Vector, /) -> tuple[Vector, Definiteness]:
         if along is not None and slopes is not None and slopes.motion == 6:
             return eliminate_poses(lower, b, unknown.xi, along, slopes, grid, free)
         return eliminate(lower, b, along, slopes, grid, free)
 
-    if along is not None and loads is not None and along.pull is not None:
-        springs = along.pull.springs(along.rotation, cut=loads.absent_but_discs)
+    if along is not None and loads is not None and pull is not None:
+        springs = pull.springs(along.rotation, cut=loads.absent_but_discs)
         solve = with_springs(solve, springs, grid)
     strain, (negative, doubtful) = solve(spread(right.wrench, free))
     places, border = borders_of(problem, unknown.coupled, at)

@@ -30,7 +30,7 @@ from ..arm.discs import steps_before
 from ..arm.scene import CrossSections, Scene
 from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import Grid, collocation, weighted
-from ..numerics.stacked import components, cross, dot, identity, rows, transpose, turned
+from ..numerics.stacked import components, cross, dot, identity, transpose, turned
 
 
 class Discs(eqx.Module):
@@ -118,7 +118,9 @@ class Pull(NamedTuple):
         first = self.discs.first
         before = self.discs.before[first + 1]
         if cut:
-            piece = jnp.cumsum(jnp.concatenate([jnp.zeros_like(self.joined[:1]), 1.0 - self.joined[:-1]]), axis=0)
+            piece = jnp.cumsum(
+                jnp.concatenate([jnp.zeros_like(self.joined[:1]), 1.0 - self.joined[:-1]]), axis=0
+            )
             own = jnp.sum(self.discs.at[first, :-1] * piece, axis=1)
             before = before * (piece == own[:, None])
         moment = cross(self.chords.length * self.chords.direction, force)
@@ -131,8 +133,9 @@ class Pull(NamedTuple):
 
     def unit(self, place: int, rotation: Array) -> Vector:
         """Wrench of a unit force in a tendon on the nodes, in their frames."""
-        own = self._of(place).reshape(-1, *(1,) * (self.force.ndim - 2))
-        return components(turned(transpose(rotation), self.carried(own * self.chords.direction)))
+        own = jnp.asarray(self._of(place)).reshape(-1, *(1,) * (self.force.ndim - 2))
+        force = jnp.where(own, self.chords.direction, 0.0)
+        return components(turned(transpose(rotation), self.carried(force)))
 
     def _of(self, place: int) -> np.ndarray:
         """Whether each chord belongs to the tendon at a place among the threads."""
@@ -147,13 +150,12 @@ class Pull(NamedTuple):
         after = jnp.concatenate([over[:, 1:], jnp.zeros_like(over[:, :1])], axis=1)
         return jnp.max(over * after, axis=0)
 
-    def cut(self, slopes: Array) -> Array:
+    def cut_slopes(self, motion: int) -> Array:
         """`slopes` of an arm that is cut where no chord passes: there only the chords before the
         cut act at their holes."""
-        joined = self.joined
-        first = self.discs.first
+        joined, first = self.joined, self.discs.first
         incoming = jnp.zeros_like(self.chords.arms).at[:, first + 1].add(self.force)
-        return joined * slopes + (1.0 - joined) * self._at_steps(incoming, slopes.shape[1])
+        return joined * self.slopes(motion) + (1.0 - joined) * self._at_steps(incoming, motion)
 
     def springs(self, rotation: Array, *, cut: bool) -> Vector:
         r"""Wrenches $w_j$ on the nodes, in their frames, for which the turning of the chords adds
@@ -239,6 +241,4 @@ def pull_of(
     since = jnp.moveaxis(weighted(collocation(axis.shape[1]), grid.h * axis, axis=1), 0, 1)
     lever = p[:, first][:, :, None, None] - r[:, None, None, :-1] - since[:, None]
     tau = jnp.stack(jnp.broadcast_arrays(*(forces[place] for place in discs.places)))
-    return Pull(
-        discs, Chords(lever, direction, length, arms), tau[discs.owner] * direction
-    )
+    return Pull(discs, Chords(lever, direction, length, arms), tau[discs.owner] * direction)

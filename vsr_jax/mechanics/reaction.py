@@ -372,9 +372,7 @@ def reaction_change(change: Array, along: Reaction, slopes: Slopes, grid: Grid) 
     return turned(transpose(R), jnp.concatenate([dm, rows(delta, 3, 6) - cross(theta, n)]))
 
 
-def react_at(
-    xi: Vector, grid: Grid, loads: Loading, X: Array, forces: Forces = ()
-) -> Vector:
+def react_at(xi: Vector, grid: Grid, loads: Loading, X: Array, forces: Forces = ()) -> Vector:
     r"""Reaction $\Lambda$ at abscissas X, six component arrays of their shape, from the strain at
     the nodes and the `forces` of the threads at their start."""
     along = react(xi, grid, loads, forces)

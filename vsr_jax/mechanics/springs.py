@@ -1,5 +1,5 @@
-r"""The tangent of an arm with springs between sections far from each other, from that without: by the
-chords of straight tendons, which turn."""
+"""The tangent of an arm with springs between sections far from each other, which the turning chords
+of straight tendons are, from the tangent without them."""
 
 from collections.abc import Callable
 
@@ -15,9 +15,7 @@ from .elimination_nodes import Definiteness
 Solve = Callable[[Vector], tuple[Vector, Definiteness]]
 
 
-def with_springs(
-    solve: Solve, springs: Vector, grid: Grid
-) -> Solve:
+def with_springs(solve: Solve, springs: Vector, grid: Grid) -> Solve:
     r"""From the `solve` of a tangent A that of $A + \sum_j w_j w_j^T$ (Woodbury's formula).
 
     Its number of negative eigenvalues is that of A, less the number of negative pivots of
@@ -37,7 +35,7 @@ def with_springs(
     factors = lu.factor(gram + one.reshape(*one.shape, *(1,) * (gram.ndim - 2)))
     held = jnp.sum(lu.diagonal(factors) < 0, axis=0, dtype=jnp.int32)
 
-    def stiffer(b: Vector) -> tuple[Vector, Definiteness]:
+    def stiffer(b: Vector, /) -> tuple[Vector, Definiteness]:
         x, (negative, doubtful) = solve(b)
         force = lu.substitute(factors, work(x))
         less = (jnp.einsum("j...,jsn...->sn...", force, answer) for answer in answers)

@@ -58,9 +58,9 @@ def extreme(scene: Scene, forces: Vector, nodes: Nodes, *, greatest: bool = Fals
     r"""Least or greatest eigenvalue of $\Sigma^{-1/2} H \Sigma^{-1/2}$: node by node without loads,
     of the whole arm with loads or straight tendons.
 
-    For the whole arm it is that of the symmetric part of the whole tangent, restricted to the changes of
-    strain that the taut cables allow; NaN if the Lanczos method does not converge. Without loads
-    cables are ignored: a finite number of them cannot stiffen every section.
+    For the whole arm it is that of the symmetric part of the whole tangent, restricted to the
+    changes of strain that the taut cables allow; NaN if the Lanczos method does not converge.
+    Otherwise cables are ignored: a finite number of them cannot stiffen every section.
     """
     if scene.reacts:
         return _extreme(arm_of(scene, forces, nodes), -1 if greatest else 0)
@@ -76,8 +76,9 @@ class Arm(eqx.Module):
     """Data of the tangent of the whole arm: strain, cross-sections, thread forces and loads at the
     nodes of a grid.
 
-    `tau`: forces of the threads along the nodes, `forces`: at their start; `units` scales changes of the free strains, $\\Sigma^{-1/2} W^{-1/2}$ with W the weights of the
-    nodes; `taut`: see `ScaledTangent`.
+    `tau`: forces of the threads along the nodes; `forces`: at their start; `units` scales changes
+    of the free strains, $\\Sigma^{-1/2} W^{-1/2}$ with W the weights of the nodes; `taut`: see
+    `ScaledTangent`.
     """
 
     xi: Vector
