@@ -144,7 +144,7 @@ def test_the_reaction_is_that_to_the_loads(weighed):
 PLACED = [0.08, 0.19]
 
 
-def placed(p):
+def coordinate(p):
     """A number of a loaded arm by five others: two tensions, two discs, the offset of a tendon."""
     tendons = [
         vsr.Tendon(vsr.Parallel(p[4], 0.0), disc_places=p[2:4], end=0.25),
@@ -157,8 +157,8 @@ def placed(p):
 
 def test_gradients_in_both_modes_are_finite_differences():
     p, scale = jnp.array([3.0, 2.0, *PLACED, 0.007]), jnp.array([1e-2, 1e-2, 1e-3, 1e-3, 1e-4])
-    forward, reverse = jax.jit(lambda p: (jax.jacfwd(placed)(p), jax.grad(placed)(p)))(p)
-    solve = jax.jit(placed)
+    forward, reverse = jax.jit(lambda p: (jax.jacfwd(coordinate)(p), jax.grad(coordinate)(p)))(p)
+    solve = jax.jit(coordinate)
     differences = central_differences(lambda unit: solve(p + scale * unit), 5)
     np.testing.assert_allclose(forward * scale, differences, rtol=1e-5, atol=1e-9)
     np.testing.assert_allclose(forward, reverse, rtol=1e-8)
@@ -209,8 +209,11 @@ def test_scene_files_keep_discs():
     read = parse_scene(text).scene
     assert repr(read) == repr(arm)
     assert read.effects == ("tendons", "sections", "discs")
-    assert read.actuators[0].discs == 4
-    np.testing.assert_array_equal(read.actuators[1].disc_places, PLACED)
+    even, placed = read.actuators
+    assert isinstance(even, vsr.Tendon)
+    assert isinstance(placed, vsr.Tendon)
+    assert even.discs == 4
+    np.testing.assert_array_equal(placed.disc_places, PLACED)
 
 
 @pytest.mark.parametrize(
