@@ -51,7 +51,7 @@ def approximate_solve(
     enough to make its pivots singular.
     """
     loads = problem.loads
-    if loads is None or loads.discs is None or loads.absent_but_discs:
+    if loads is None or loads.discs is None or loads.only_discs:
         unknown, at, right, problem, damping = c.single(
             (unknown, at, right, problem, jnp.asarray(damping))
         )
@@ -66,7 +66,7 @@ def approximate_solve(
         slopes = pull = None
     else:
         slopes, pull = slopes_of(along, loads), along.pull
-        if pull is not None and loads.absent_but_discs:
+        if pull is not None and loads.only_discs:
             slopes = slopes._replace(ends=pull.cut_slopes(slopes.motion), joined=pull.joined)
 
     def solve(b: Vector, /) -> tuple[Vector, Definiteness]:
@@ -75,7 +75,7 @@ def approximate_solve(
         return eliminate(lower, b, along, slopes, grid, free)
 
     if along is not None and loads is not None and pull is not None:
-        springs = pull.springs(along.rotation, cut=loads.absent_but_discs)
+        springs = pull.springs(along.rotation, cut=loads.only_discs)
         solve = with_springs(solve, springs, grid)
     strain, (negative, doubtful) = solve(spread(right.wrench, free))
     places, border = borders_of(problem, unknown.coupled, at)

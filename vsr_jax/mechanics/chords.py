@@ -7,8 +7,8 @@ force in the chord,
 
 $$w = ((p_i - r) \times e_i, \ e_i),$$
 
-which takes the place of the column $(d \times t, t)$ of $B_\tau$. So $\tau w$ is a part of the
-reaction at X: chords join the tip of a step with sections far from it, as loads do.
+which takes the place of the column $(d \times t, t)$ of $B_\tau$. It depends on the strain up to
+the next hole, so $\tau w$ is a part of the reaction at X.
 
 Where the force $f_i = \tau e_i$ of a chord keeps its direction in space, the tangent is that of
 dead forces at the holes. Beside that the chord turns,

@@ -81,7 +81,7 @@ class Loading(NamedTuple):
     base: Array | None
 
     @property
-    def absent_but_discs(self) -> bool:
+    def only_discs(self) -> bool:
         """Whether there are no loads, only straight tendons."""
         dead = self.dead is None and self.follower_density is None
         return dead and not (self.follower_points or self.by_pose)

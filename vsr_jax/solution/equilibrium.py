@@ -117,7 +117,7 @@ class Equilibrium(Solved):
         X. The rod and the threads carry it together."""
         nodes = self.nodes
         loads = loading(self.scene, nodes.grid)
-        if loads is None or loads.absent_but_discs:
+        if loads is None or loads.only_discs:
             return jnp.zeros((X.size, 6), X.dtype)
         loads = loads._replace(discs=None)  # straight tendons are threads, too
         return c.join(react_at(nodes.xi, nodes.grid, loads, X))
