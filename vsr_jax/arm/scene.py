@@ -10,18 +10,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..numerics.component import Forces, Vector, Wrench, add, dot
-from ..numerics.quadrature import make_grid, piece_edges
+from ..numerics.component import Forces, Vector, Wrench, add
+from ..numerics.quadrature import piece_edges
 from ..typing import ArrayLike, DTypeLike, Scalar, VectorLike, cast
 from ..validation import concrete, instance, instances, is_traced, numbers, precise
 from .actuator import Actuator
 from .description import Part, describe, described_arguments, table
+from .discs import inner_discs, rest_length
 from .held import Held
 from .loads import Frame, Load
 from .obstacles import Obstacle
 from .pose_loads import PoseLoad
 from .rod import STRAINS, Rod
-from .routing import Path, thread_tangent
+from .routing import Path
 from .scene_checks import check_held, check_numbers, check_obstacles
 from .scene_numbers import checked_values, replaced
 
@@ -158,10 +159,20 @@ class Scene(Part):
         return tuple(i for i, actuator in enumerate(self.actuators) if actuator.frictional)
 
     @property
+    def straight(self) -> tuple[int, ...]:
+        """Indices of the actuators that run straight from disc to disc."""
+        return tuple(i for i, actuator in enumerate(self.actuators) if actuator.straight)
+
+    @property
+    def reacts(self) -> bool:
+        """Whether sections bear wrenches from beyond them, of loads or of straight tendons."""
+        return bool(self.loaded or self.straight)
+
+    @property
     def coupled(self) -> bool:
         """Whether the cross-sections depend on each other: through loads, held sections, obstacles,
-        given thread lengths or friction."""
-        return bool(self.loaded or self.length_driven or self.frictional)
+        straight tendons, given thread lengths or friction."""
+        return bool(self.reacts or self.length_driven or self.frictional)
 
     @property
     def loaded(self) -> bool:
@@ -176,6 +187,7 @@ class Scene(Part):
         return (
             *self.rod.breakpoints,
             *laid,
+            *inner_discs(self.rod, self.actuators),
             *(x for load in self.loads for x in load.breakpoints(self.rod)),
             *(held.X for held in self.held if held.X is not None),
         )
@@ -285,7 +297,7 @@ class Scene(Part):
 
     def rest_length(self, place: int) -> Scalar:
         """Length of a thread's path at rest [m]."""
-        return _rest_length(self, place)
+        return rest_length(self.rod, self.actuators[place])
 
     def replace(
         self,
@@ -334,11 +346,3 @@ class Scene(Part):
 def _line(part: Any) -> str:
     text = describe(part)
     return f"{text}, input in {part.unit}" if isinstance(part, Actuator) else text
-
-
-@eqx.filter_jit
-def _rest_length(scene: Scene, place: int) -> Scalar:
-    grid = make_grid(scene.edges(), 32, 3)
-    sections = scene.sections(grid.X)
-    t_c, reach = thread_tangent(sections.rest, sections.paths[place]), sections.reach[place]
-    return jnp.sum(grid.weight * jnp.sqrt(dot(t_c, t_c)) * (1.0 if reach is None else reach))

@@ -14,6 +14,7 @@ from ..numerics.quadrature import make_grid
 from ..typing import Scalar
 from ..validation import ROUNDING, concrete, numbers
 from .actuator import Actuator
+from .discs import check_discs
 from .held import Held
 from .loads import Load
 from .obstacles import Obstacle
@@ -82,6 +83,8 @@ def _check_places(
                     f"Scene.actuators[{i}].{name}: got {float(x):g} m, need a place on the "
                     f"arm of {length:g} m"
                 )
+        if actuator.straight:
+            check_discs(f"Scene.actuators[{i}]", actuator, rod.length)
     for i, load in enumerate(loads):
         X = load.place(rod)
         if X is not None and float(X) > beyond:

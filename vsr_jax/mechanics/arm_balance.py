@@ -85,8 +85,9 @@ def state_of(xi: Vector, coupled: tuple[PyTree, ...], problem: ArmProblem) -> Ar
     forces = forces_at(couplings, coupled, problem.forces)
     carried = _carried(xi, coupled, problem, forces)
     loads = loads_with(couplings, coupled, problem.loads)
-    along = None if loads is None else react(xi, grid, loads)
-    at = ArmState(xi, carried, shared(forces, carried.shares), loads, along, ())
+    along = None if loads is None else react(xi, grid, loads, forces)
+    tau = problem.along_sections(shared(forces, carried.shares))
+    at = ArmState(xi, carried, tau, loads, along, ())
     pairs = zip(couplings, coupled, strict=True)
     return at._replace(notes=tuple(coupling.note(x, at, problem) for coupling, x in pairs))
 
@@ -101,9 +102,9 @@ def _carried(
 
 
 def carried_forces(unknown: ArmUnknown, problem: ArmProblem) -> Forces:
-    """Force of each thread at the nodes."""
+    """Force of each thread along the nodes."""
     forces = forces_at(problem.couplings, unknown.coupled, problem.forces)
-    return shared(forces, _carried(*unknown, problem, forces).shares)
+    return problem.along_sections(shared(forces, _carried(*unknown, problem, forces).shares))
 
 
 def imbalance_of(

@@ -21,6 +21,7 @@ from .elimination_nodes import Definiteness
 from .pose_elimination import eliminate_poses
 from .reaction import slopes_of
 from .sizes import node_weight
+from .springs import with_springs
 
 _REFINEMENTS = 60
 """Bound on the refinement steps of a tangent system; 5 to 10 are usual."""
@@ -44,12 +45,16 @@ def approximate_solve(
     has the tangent 1), whether it is definite for the changes of shape that the couplings allow,
     and whether that is doubtful.
 
-    In single precision throughout: the passes along the arm are bound by memory, and rounding is
-    far below the error of the elimination.
+    In single precision: the passes along the arm are bound by memory, and rounding is far below the
+    error of the elimination. Straight tendons of an arm with loads keep the precision of the
+    unknowns: their forces without their turning, which the elimination takes first, are large
+    enough to make its pivots singular.
     """
-    unknown, at, right, problem, damping = c.single(
-        (unknown, at, right, problem, jnp.asarray(damping))
-    )
+    loads = at.loads
+    if loads is None or loads.discs is None or loads.only_discs:
+        unknown, at, right, problem, damping = c.single(
+            (unknown, at, right, problem, jnp.asarray(damping))
+        )
     sections, grid, flexible = problem.sections, problem.grid, problem.sections.flexible
     lower = tangent(unknown.xi, sections, at.tau)
     lower = tuple(
@@ -57,13 +62,21 @@ def approximate_solve(
     )
 
     along, loads = at.along, at.loads
-    slopes = None if along is None or loads is None else slopes_of(along, loads)
+    if along is None or loads is None:
+        slopes = pull = None
+    else:
+        slopes, pull = slopes_of(along, loads), along.pull
+        if pull is not None and loads.only_discs:
+            slopes = slopes._replace(ends=pull.cut_slopes(slopes.motion), joined=pull.joined)
 
-    def solve(b: Vector) -> tuple[Vector, Definiteness]:
+    def solve(b: Vector, /) -> tuple[Vector, Definiteness]:
         if along is not None and slopes is not None and slopes.motion == 6:
             return eliminate_poses(lower, b, unknown.xi, along, slopes, grid, free, flexible)
         return eliminate(lower, b, along, slopes, grid, free, flexible)
 
+    if along is not None and loads is not None and pull is not None:
+        springs = pull.springs(along.rotation, cut=loads.only_discs)
+        solve = with_springs(solve, springs, grid)
     strain, (negative, doubtful) = solve(spread(right.wrench, free))
     borders, border = borders_of(problem, unknown.coupled, at)
     if border is None:

@@ -22,7 +22,9 @@ from ..numerics.quadrature import Grid
 from ..numerics.stacked import stack
 from ..typing import Scalar
 from .balance import largest_force_scale, thread_direction, thread_wrench
+from .chords import Pull, discs_of
 from .coupling import ArmProblem, ArmState, Border, Coupling
+from .reaction import Loading, react
 from .sizes import pull_of
 
 
@@ -73,11 +75,34 @@ class Lengths(Coupling):
 
     def note(self, x: Array, at: ArmState, problem: ArmProblem) -> Vector:
         """Slack of each [m]."""
-        grid, sections, shares = problem.grid, problem.sections, at.carried.shares
+        shares = at.carried.shares
         return tuple(
-            cable.slack(tension, path_length(at.xi, sections, place, grid), shares[place], grid)
+            cable.slack(tension, self._length(place, at, problem), shares[place], problem.grid)
             for place, cable, tension in zip(self.places, self.cables, x, strict=True)
         )
+
+    def _length(self, place: int, at: ArmState, problem: ArmProblem) -> Array:
+        pull = _pull_of(at, place)
+        if pull is not None:
+            return pull.length(place)
+        return path_length(at.xi, problem.sections, place, problem.grid)
+
+    def _wrenches(self, at: ArmState, problem: ArmProblem) -> tuple[list[Vector], list[Vector]]:
+        """Wrenches at the nodes by which each residual changes with the tension, and each length
+        with the strain."""
+        pulls, lengths = [], []
+        for place in self.places:
+            pull = _pull_of(at, place)
+            if pull is None or at.along is None:
+                path = problem.sections.paths[place]
+                wrench = thread_wrench(thread_direction(at.xi, path)[0], path)
+                pulls.append(c.times(at.carried.gains[place], wrench))
+                lengths.append(c.times(problem.sections.reach[place], wrench))
+            else:
+                wrench = pull.unit(place, at.along.rotation)
+                pulls.append(wrench)
+                lengths.append(wrench)
+        return pulls, lengths
 
     def residual(
         self, x: Array, at: ArmState, note: Vector, problem: ArmProblem, free: tuple[int, ...]
@@ -87,10 +112,8 @@ class Lengths(Coupling):
         return jnp.stack([jnp.where(tension < slack, tension, slack) for tension, slack in pairs])
 
     def border(self, x: Array, at: ArmState, note: Vector, problem: ArmProblem) -> Border:
-        sections, grid, gains = problem.sections, problem.grid, at.carried.gains
-        paths = [sections.paths[place] for place in self.places]
-        wrenches = [thread_wrench(thread_direction(at.xi, path)[0], path) for path in paths]
-        pairs = list(zip(self.places, wrenches, strict=True))
+        grid, gains = problem.grid, at.carried.gains
+        pulls, lengths = self._wrenches(at, problem)
         factors, corner = [], []
         for place, cable, tension, slack in zip(self.places, self.cables, x, note, strict=True):
             loose = tension < cable.scale * slack
@@ -98,8 +121,8 @@ class Lengths(Coupling):
             stretch = cable.scale * cable.stretch(gains[place], grid)
             corner.append(jnp.where(loose, 1.0, stretch))
         return Border(
-            _stacked([c.times(gains[place], wrench) for place, wrench in pairs]),
-            _stacked([c.times(sections.reach[place], wrench) for place, wrench in pairs]),
+            _stacked(pulls),
+            _stacked(lengths),
             jnp.stack(factors),
             jnp.stack(corner),
         )
@@ -142,10 +165,35 @@ def cable_of(
 ) -> Cable:
     """The cable of a tendon with prescribed length, for a change of its length [m]."""
     stiffness = scene.actuators[place].cable_stiffness
-    length = path_length(sections.rest, sections, place, grid) + change
+    length = thread_length(scene, sections.rest, sections, place, grid) + change
     compliance = None if stiffness is None else 1 / stiffness
     scale = largest_force_scale(sections) / scene.rod.length
     return Cable(length, compliance, scale)
+
+
+def _pull_of(at: ArmState, place: int) -> Pull | None:
+    """The chords of an arm, if a tendon runs straight; None if it runs along its path."""
+    pull = None if at.along is None else at.along.pull
+    return pull if pull is not None and place in pull.discs.places else None
+
+
+def thread_length(
+    scene: Scene, xi: Vector, sections: CrossSections, place: int, grid: Grid
+) -> Array:
+    """Length of a thread [m], from the strain at the nodes: of its path, or the sum of its
+    chords."""
+    if not scene.actuators[place].straight:
+        return path_length(xi, sections, place, grid)
+    return chords_of(scene, xi, grid).length(place)
+
+
+def chords_of(scene: Scene, xi: Vector, grid: Grid) -> Pull:
+    """The chords of the straight tendons of a scene without their forces."""
+    zero = (jnp.zeros_like(scene.rod.length),) * len(scene.actuators)
+    only = Loading(None, None, None, (), (), discs_of(scene, grid), scene.rod.base)
+    pull = react(xi, grid, only, zero).pull
+    assert pull is not None  # see `Scene.straight`
+    return pull
 
 
 def path_length(xi: Vector, sections: CrossSections, place: int, grid: Grid) -> Array:

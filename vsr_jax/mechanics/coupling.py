@@ -81,6 +81,11 @@ class ArmProblem(NamedTuple):
             couplings=tuple(coupling.relaxed() for coupling in self.couplings),
         )
 
+    def along_sections(self, tau: Forces) -> Forces:
+        """Forces at the nodes of the threads that run along the sections, zero for the others."""
+        discs = None if self.loads is None else self.loads.discs
+        return tau if discs is None else discs.elsewhere(tau)
+
     @property
     def follows_rate(self) -> bool:
         """Whether a coupling follows the strain and its derivative along the arm: the tangent lacks
@@ -99,9 +104,9 @@ class ArmProblem(NamedTuple):
 
 
 class ArmState(NamedTuple):
-    """Quantities computed from the unknowns: the strain, what the threads carry, their forces at
-    the nodes, the loads with those of the couplings, the reaction (both None without loads), and
-    what each coupling noted."""
+    """Quantities computed from the unknowns: the strain, what the threads carry, their forces along
+    the nodes, the loads with those of the couplings, the reaction (both None without loads and
+    straight tendons), and what each coupling noted."""
 
     xi: Vector
     carried: Carried

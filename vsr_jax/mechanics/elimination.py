@@ -57,7 +57,8 @@ class StepNodes(NamedTuple):
     of the loads at the end of the step by rotations, None where there are none; `flexible` of the
     sections.
 
-    Behind the components come the axis of the nodes (but for h and `jump`) and those of steps or
+    Behind the components come the axis of the nodes (but for h, `jump` and
+    `joined`) and those of steps or
     arms.
     """
 
@@ -73,6 +74,7 @@ class StepNodes(NamedTuple):
     slope: Array | None
     jump: Array | None
     flexible: Array | None
+    joined: Array | None
 
 
 class Sections(NamedTuple):
@@ -98,6 +100,7 @@ class Condensed(NamedTuple):
     - `turn` (3, columns), `turned`: rotation at the end.
     - `start` (wrench, columns), `started`: change of the wrench at the start.
     - `jump` (6, 3): derivative of the loads at the end by their rotation, None without such loads.
+    - `joined`: 0 where the arm is cut at the end, 1 where it is not; None without cuts.
     - `moment`, `compliance`: the moment at the start and the compliance of the first node.
     """
 
@@ -108,6 +111,7 @@ class Condensed(NamedTuple):
     turned: Array
     started: Array
     jump: Array | None
+    joined: Array | None
     moment: Array
     compliance: Array
 
@@ -178,10 +182,11 @@ def eliminate(
         strain = _by_start(nodes, sections, step, _moved(joint, 0, last))
 
     def forward(theta: Array, step: tuple) -> tuple[Array, Array]:
-        turn, more = jax.tree.map(once, step)
-        return matvec(turn, theta) + more, theta
+        turn, more, joined = jax.tree.map(once, step)
+        return c.times(joined, matvec(turn, theta) + more), theta
 
-    _, theta = lax.scan(forward, nothing[:3, 0], (turn, turned_end))
+    joined = _moved(nodes.joined, last, 0)
+    _, theta = lax.scan(forward, nothing[:3, 0], (turn, turned_end, joined))
     by_theta, constant = strain
     found = matvec(by_theta, jnp.moveaxis(theta, 0, last)[:, None]) + constant
     found = turned(transpose(nodes.rotation), found)
@@ -226,6 +231,7 @@ def _nodes(
         None if slopes.density is None else whole(slopes.density),
         None if jump is None else jnp.broadcast_to(jump, (*jump.shape[:2], *shape[1:])),
         None if flexible is None else whole(flexible),
+        None if slopes.joined is None else jnp.broadcast_to(slopes.joined, shape[1:]),
     )
 
 
@@ -237,13 +243,16 @@ def _apart(nodes: StepNodes, grid: Grid) -> StepNodes:
         shape = (*x.shape[:place], 1, stages * steps, *x.shape[place + 2 :])
         return x.swapaxes(place, place + 1).reshape(shape)
 
-    apart = nodes._replace(h=None, jump=None)
+    apart = nodes._replace(h=None, jump=None, joined=None)
     apart = jax.tree.map(lambda x: own(x, x.ndim - nodes.axis.ndim + 1), apart)
     jump = nodes.jump
     if jump is not None:
         jump = own(at_last_nodes(jump, stages), 2)[:, :, 0]
+    joined = nodes.joined
+    if joined is not None:
+        joined = own(1.0 - at_last_nodes((1.0 - joined)[None, None], stages), 2)[0, 0, 0]
     h = own(jnp.broadcast_to(grid.weight, nodes.axis.shape[1:]), 0)[0]
-    return apart._replace(h=h, jump=jump)
+    return apart._replace(h=h, jump=jump, joined=joined)
 
 
 def _moved(tree: Tree, source: int, destination: int) -> Tree:
@@ -293,6 +302,7 @@ def _condensed(node: StepNodes, free: tuple[int, ...]) -> tuple[Sections, Conden
         h * weighted(weights, bent, 1),
         started,
         node.jump,
+        node.joined,
         node.wrench[:3, 0] + before,
         sections.compliance[:, :, 0],
     )
@@ -396,6 +406,8 @@ def _joined(end: tuple[Array, Array], step: Condensed) -> tuple[tuple, tuple[Joi
     pivots and the asymmetry."""
     step = jax.tree.map(once, step)  # fused with a use of theirs, slices of the scan are slow
     P, p = end
+    if step.joined is not None:
+        P, p = step.joined * P, step.joined * p
     if step.jump is not None:
         P = P + step.jump
     by_end = columns(step.turn, 3, step.turn.shape[1])

@@ -153,7 +153,7 @@ def turns(R: Array) -> Array:
 
 def jumps(slopes: Slopes, grid: Grid) -> Array | None:
     """Derivatives (6, motion, steps, ...) of the loads at points, each at the end of the step
-    before it; None without such loads."""
+    before it, and of the chords and contacts; None without any."""
     total = slopes.ends
     for point in slopes.points:
         step = jnp.arange(grid.h.shape[0]).reshape(-1, *(1,) * point.step.ndim) == point.step - 1

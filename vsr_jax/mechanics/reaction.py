@@ -19,7 +19,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ..arm.scene import Scene
-from ..numerics.component import Vector
+from ..numerics.component import Forces, Vector
 from ..numerics.magnus import magnus_6
 from ..numerics.quadrature import (
     Grid,
@@ -46,6 +46,7 @@ from ..numerics.stacked import (
     transpose,
     turned,
 )
+from .chords import Discs, Pull, discs_of, pull_of
 from .pose_terms import PoseTerm, finite, pose_terms
 from .touch import Surroundings, Touch, at_ends, contact_forces, touch_of
 
@@ -68,6 +69,7 @@ class Loading(NamedTuple):
     - `follower_density`: $(c, f)$ in the body frame; `follower_points`: wrenches at points in the
       body frame;
     - `by_pose`: loads that depend on the pose of their section;
+    - `discs`: tendons that run straight from disc to disc;
     - `around`: the obstacles and the contact forces;
     - `base`: pose of the base, the identity for None.
     """
@@ -77,8 +79,15 @@ class Loading(NamedTuple):
     follower_density: Array | None
     follower_points: tuple[FollowerPoint, ...]
     by_pose: tuple[PoseTerm, ...]
+    discs: Discs | None
     base: Array | None
     around: Surroundings | None = None
+
+    @property
+    def only_discs(self) -> bool:
+        """Whether there are no loads, only straight tendons."""
+        dead = self.dead is None and self.follower_density is None
+        return dead and not (self.follower_points or self.by_pose or self.around)
 
     @property
     def motion(self) -> int:
@@ -86,8 +95,8 @@ class Loading(NamedTuple):
         loads, 3 (rotation) or 6 (and displacement)."""
         if self.around is not None or any(term.load.needs == "pose" for term in self.by_pose):
             return 6
-        turns = self.by_pose or self.follower_points or self.follower_density is not None
-        return 3 if turns else 0
+        turns = self.by_pose or self.follower_points
+        return 3 if turns or self.follower_density is not None or self.discs is not None else 0
 
     def scaled(self, share: Array) -> "Loading":
         """A fraction of all loads."""
@@ -128,6 +137,7 @@ class Reaction(NamedTuple):
       points (6,) and the follower density.
     - `body_density`: density (c, f) of all loads in the body frame.
     - `seen`: rotation and position where each load acts that depends on the pose.
+    - `pull`: the chords of straight tendons, whose wrenches are parts of `world` and `wrench`.
     - `touch`: the contacts.
     """
 
@@ -142,6 +152,7 @@ class Reaction(NamedTuple):
     follower: Array | None
     body_density: Array
     seen: tuple[tuple[Array, Array | None], ...]
+    pull: Pull | None
     touch: Touch | None
 
 
@@ -157,24 +168,27 @@ class PointSlope(NamedTuple):
 class Slopes(NamedTuple):
     """Derivatives of the loads in the world frame with respect to motions of their sections: of the
     density (6, motion, stages, steps), None if it is constant, of the wrenches at points, and of
-    those at the ends of the steps (6, motion, steps), None if there are none."""
+    those of chords and contacts at the ends of the steps (6, motion, steps).
+
+    `joined`: 0 for each step at whose end the arm can be cut, since the wrenches on each side
+    depend on the motions of that side relative to the cut; None without cuts."""
 
     density: Array | None
     points: tuple[PointSlope, ...]
-    ends: Array | None = None
+    ends: Array | None
+    joined: Array | None = None
 
     @property
     def motion(self) -> int:
         """Size of the motions, see `Loading.motion`."""
-        if self.ends is not None:
-            return 6
-        matrices = [x for x in (self.density, *(p.matrix for p in self.points)) if x is not None]
+        every = (self.density, self.ends, *(p.matrix for p in self.points))
+        matrices = [x for x in every if x is not None]
         return matrices[0].shape[1] if matrices else 0
 
 
 def loading(scene: Scene, grid: Grid) -> Loading | None:
-    """The loads of a scene on a grid; None if it has none."""
-    if not scene.loaded:
+    """The loads and straight tendons of a scene on a grid; None if it has none."""
+    if not scene.reacts:
         return None
     dead_density, follower_density = (scene.density(grid.X, frame) for frame in ("world", "body"))
     density = None if dead_density is None else stack(dead_density)
@@ -187,7 +201,8 @@ def loading(scene: Scene, grid: Grid) -> Loading | None:
         FollowerPoint(*before_point(grid, X), stack(wrench))
         for X, wrench in scene.point_wrenches("body")
     )
-    return Loading(dead, density, follower, points, pose_terms(scene, grid), scene.rod.base)
+    by_pose, discs = pose_terms(scene, grid), discs_of(scene, grid)
+    return Loading(dead, density, follower, points, by_pose, discs, scene.rod.base)
 
 
 def partial_rotation(k: Array, h: Array, sigma: Array | float) -> Array:
@@ -236,9 +251,9 @@ def rotations(k: Array, h: Array, base: Array | None) -> tuple[Array, Array, Arr
     return starts, matmul(starts[:, :, None], within_step[:, :, :-1]), end
 
 
-def react(xi: Vector, grid: Grid, loads: Loading) -> Reaction:
+def react(xi: Vector, grid: Grid, loads: Loading, forces: Forces = ()) -> Reaction:
     """Reaction at the nodes for the strain `xi`, six component arrays of shape (stages, steps,
-    *arms)."""
+    *arms), and for the `forces` of the threads at their start."""
     whole = stack(xi)
     starts, R, end = rotations(rows(whole, 0, 3), grid.h, loads.base)
     zero, back = jnp.zeros_like(whole), transpose(R)
@@ -271,9 +286,27 @@ def react(xi: Vector, grid: Grid, loads: Loading) -> Reaction:
         world = world + jnp.concatenate([jnp.zeros_like(pushed), pushed])
     arm = cross(axis, rows(world, 3, 6))
     world, density = _with_moment(world, beyond(arm, grid)), _with_moment(density, arm)
+    pull = None
+    if loads.discs is not None:
+        pull = pull_of(loads.discs, starts, end, axis, grid, forces)
+        chords = pull.wrench
+        world = world + chords
+        density = _with_moment(density, cross(axis, rows(chords, 3, 6)))
     wrench = turned(back, world)
     return Reaction(
-        starts, end, R, world, density, wrench, axis, points, follower, body_density, seen, touch
+        starts,
+        end,
+        R,
+        world,
+        density,
+        wrench,
+        axis,
+        points,
+        follower,
+        body_density,
+        seen,
+        pull,
+        touch,
     )
 
 
@@ -312,7 +345,10 @@ def slopes_of(along: Reaction, loads: Loading) -> Slopes:
             points.append(PointSlope(term.step, term.before, here))
         else:
             density = here if density is None else density + here
-    ends = None if along.touch is None else at_ends(along.touch)
+    ends = None if along.pull is None else along.pull.slopes(size)
+    if along.touch is not None:
+        pressed = at_ends(along.touch)
+        ends = pressed if ends is None else ends + pressed
     return Slopes(density, tuple(points), ends)
 
 
@@ -362,10 +398,10 @@ def reaction_change(change: Array, along: Reaction, slopes: Slopes, grid: Grid) 
     return turned(transpose(R), jnp.concatenate([dm, rows(delta, 3, 6) - cross(theta, n)]))
 
 
-def react_at(xi: Vector, grid: Grid, loads: Loading, X: Array) -> Vector:
+def react_at(xi: Vector, grid: Grid, loads: Loading, X: Array, forces: Forces = ()) -> Vector:
     r"""Reaction $\Lambda$ at abscissas X, six component arrays of their shape, from the strain at
-    the nodes."""
-    along = react(xi, grid, loads)
+    the nodes and the `forces` of the threads at their start."""
+    along = react(xi, grid, loads, forces)
     step, sigma = locate(grid, X)
     k = stack(xi[:3])[:, :, step]
     turn = stacked_rotation(partial_rotation(k, grid.h[step], sigma))

@@ -315,6 +315,16 @@ def resolved(model: Model, scene: Scene, outcome: Outcome) -> Outcome:
     )
 
 
+def refuse_straight(scene: Scene, model: Model) -> None:
+    """Raises `ValueError` for tendons with discs, for models of threads along the sections."""
+    if scene.straight:
+        raise ValueError(
+            f"scene.actuators[{scene.straight[0]}].discs: got a tendon that runs straight from "
+            f"disc to disc and {type(model).__name__}, need StrainDependent, the model for such "
+            f"tendons"
+        )
+
+
 def classify(
     xi: Vector,
     sections: CrossSections,

@@ -27,7 +27,7 @@ from ..mechanics.balance import (
     without_force,
 )
 from ..mechanics.coupling import ArmProblem, Coupling, forces_at
-from ..mechanics.reaction import Loading, react_at
+from ..mechanics.reaction import Loading, loading, react_at
 from ..numerics.component import Forces, Vector
 from ..numerics.magnus import ORDERS
 from ..numerics.quadrature import Grid
@@ -94,9 +94,9 @@ class StrainDependent(SteppedModel):
     def memory(self, near: Near) -> tuple[Coupling, ...]:
         """The couplings of a solution by this model, with the memory of it."""
         state, grid = near.state, self.grid(near.scene)
-        old = ArmProblem(
-            grid, near.scene.sections(grid.X), near.forces, None, state.couplings
-        )  # its loads do not count
+        loads = loading(near.scene, grid) if near.scene.straight else None  # others do not count
+        sections = near.scene.sections(grid.X)
+        old = ArmProblem(grid, sections, near.forces, loads, state.couplings)
         at = state_of(state.xi, state.coupled, old)
         return tuple(
             coupling.after(x, at, old)
@@ -118,10 +118,10 @@ class StrainDependent(SteppedModel):
         self, scene: Scene, problem: ArmProblem, guess: ArmUnknown | None = None
     ) -> Outcome:
         unknown, balanced, definite, steps = solve_arm(problem, scene.free, guess)
-        tau = carried_forces(unknown, problem)
-        status = classify(
-            unknown.xi, problem.sections, tau, balanced, definite, loaded=scene.loaded
-        )
+        tau, sections = carried_forces(unknown, problem), problem.sections
+        if problem.loads is not None and problem.loads.discs is not None:
+            sections = problem.loads.discs.beside(sections)
+        status = classify(unknown.xi, sections, tau, balanced, definite, loaded=scene.reacts)
         sound = status == Status.CONVERGED
         forces = forces_at(problem.couplings, unknown.coupled, problem.forces)
         xi = rest_where_failed(status, unknown.xi, problem.sections)
@@ -189,8 +189,10 @@ class StrainDependent(SteppedModel):
     ) -> Vector:
         grid = self.grid(scene)
         loads = self.loading(scene, state, grid)
-        reaction = None if loads is None else react_at(state.xi, grid, loads, X)
+        reaction = None if loads is None else react_at(state.xi, grid, loads, X, forces)
         tau = shared(forces, state.shares_at(scene, grid, X, forces))
+        if loads is not None and loads.discs is not None:
+            tau = loads.discs.elsewhere(tau)
         start = tuple(jnp.interp(X, grid.X.T.reshape(-1), x.T.reshape(-1)) for x in state.xi)
         sections = scene.sections(X)
         xi = solve_balance(sections, tau, reaction, scene.free, start).xi

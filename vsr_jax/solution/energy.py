@@ -22,7 +22,7 @@ from ..arm.pose_loads import PoseLoad
 from ..arm.rod import Rod
 from ..arm.scene import Scene
 from ..mechanics.balance import thread_direction
-from ..mechanics.cable import cable_of
+from ..mechanics.cable import cable_of, chords_of
 from ..models.base import Nodes
 from ..numerics import component as c
 from ..numerics.component import Vector
@@ -64,6 +64,8 @@ def energy_of(
     for i, path in enumerate(nodes.sections.paths):
         if i in driven:
             cables = cables + _stretch(scene, inputs, forces, nodes, i)
+        elif i in scene.straight:
+            actuation -= forces[i] * chords_of(scene, nodes.xi, nodes.grid).length(i)
         else:
             actuation -= jnp.sum(weight * tau[i] * thread_direction(nodes.xi, path)[1])
     return Energy(elastic, cables, actuation, _of_loads(scene, nodes, poses))

@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..arm.discs import on_chords, points_at
 from ..arm.scene import Scene
 from ..mechanics.arm_balance import ArmUnknown
 from ..mechanics.balance import forces_where
-from ..mechanics.cable import cable_of, path_length
+from ..mechanics.cable import cable_of, thread_length
 from ..mechanics.coupling import ArmProblem
 from ..mechanics.reaction import react_at
 from ..models.base import Model, Nodes, Outcome, Status
@@ -119,8 +120,9 @@ class Equilibrium(Solved):
         X. The rod and the threads carry it together."""
         nodes = self.nodes
         loads = self.model.loading(self.scene, self.state, nodes.grid)
-        if loads is None:
+        if loads is None or loads.only_discs:
             return jnp.zeros((X.size, 6), X.dtype)
+        loads = loads._replace(discs=None)  # straight tendons are threads, too
         return c.join(react_at(nodes.xi, nodes.grid, loads, X))
 
     @quantity("1")
@@ -180,9 +182,11 @@ class Equilibrium(Solved):
 
     @quantity("m", "actuator")
     def lengths(self) -> Float[Array, " threads"]:
-        r"""Length of each thread's path [m], $l_i = \int \lVert t_{ci} \rVert dX$."""
+        r"""Length of each thread's path [m], $l_i = \int \lVert t_{ci} \rVert dX$, or of its chords
+        between discs."""
         nodes, places = self.nodes, range(len(self.scene.actuators))
-        lengths = [path_length(nodes.xi, nodes.sections, i, nodes.grid) for i in places]
+        scene, xi, grid = self.scene, nodes.xi, nodes.grid
+        lengths = [thread_length(scene, xi, nodes.sections, i, grid) for i in places]
         return jnp.array(lengths, self.inputs.dtype)
 
     @quantity("N", "actuator")
@@ -200,7 +204,7 @@ class Equilibrium(Solved):
         for place in scene.length_driven:
             cable = cable_of(scene, self.inputs[place], place, nodes.sections, nodes.grid)
             tension = -self.sound_forces[place]
-            path = path_length(nodes.xi, nodes.sections, place, nodes.grid)
+            path = thread_length(scene, nodes.xi, nodes.sections, place, nodes.grid)
             loose = cable.slack(tension, path, nodes.shares[place], nodes.grid)
             slack = slack.at[place].set(jnp.where(tension > 0, 0.0, loose))
         return slack
@@ -212,7 +216,8 @@ class Equilibrium(Solved):
         return self.model.coordinates(self.scene, self.sound_forces, self.state)
 
     def thread(self, index: int, X: VectorLike) -> Float[Array, "... 3"]:
-        """Position [m] of thread `index` where it crosses the sections at X: $r + R d$.
+        """Position [m] of thread `index` where it crosses the sections at X: $r + R d$. Between
+        discs it is the point of the chord that divides it as X divides the arm there.
 
         **Arguments:** `index`: index of its actuator in the scene, from 0; `X` [m]: between the
         start and the end of the thread.
@@ -287,8 +292,12 @@ class Equilibrium(Solved):
 
     @eqx.filter_jit
     def _thread(self, index: int, X: Array) -> Array:
+        actuator = self.scene.actuators[index]
+
         def place(x: Array) -> Array:
-            g, path = self.pose(x), self.scene.sections(x).paths[index]
-            return g[:, :3, 3] + g[:, :3, 1] * path.y[:, None] + g[:, :3, 2] * path.z[:, None]
+            if not actuator.straight:
+                return points_at(actuator, x, self.pose(x))
+            holes = actuator.holes(self.scene.rod.length)
+            return on_chords(points_at(actuator, holes, self.pose(holes)), holes, x)
 
         return masked_along(self, X, place, self._ends(index))

@@ -33,7 +33,17 @@ from ..mechanics.balance import (
     thread_direction,
     thread_wrench,
 )
-from ..mechanics.reaction import Loading, Reaction, loading, partial_rotation, react, slopes_of
+from ..mechanics.cable import chords_of
+from ..mechanics.chords import Pull
+from ..mechanics.reaction import (
+    Loading,
+    Reaction,
+    loading,
+    partial_rotation,
+    react,
+    rotations,
+    slopes_of,
+)
 from ..models.base import Nodes
 from ..numerics import component as c, stacked
 from ..numerics.component import Matrix, Vector
@@ -52,13 +62,13 @@ def extreme_supported(arm: Supported, *, greatest: bool = False) -> Array:
 
 def extreme(scene: Scene, forces: Vector, nodes: Nodes, *, greatest: bool = False) -> Array:
     r"""Least or greatest eigenvalue of $\Sigma^{-1/2} H \Sigma^{-1/2}$: node by node without loads,
-    of the whole arm with loads.
+    of the whole arm with loads or straight tendons.
 
-    With loads it is that of the symmetric part of the whole tangent, restricted to the changes of
-    strain that the taut cables allow; NaN if the Lanczos method does not converge. Without loads
-    cables are ignored: a finite number of them cannot stiffen every section.
+    For the whole arm it is that of the symmetric part of the whole tangent, restricted to the
+    changes of strain that the taut cables allow; NaN if the Lanczos method does not converge.
+    Otherwise cables are ignored: a finite number of them cannot stiffen every section.
     """
-    if scene.loads:
+    if scene.reacts:
         return _extreme(arm_of(scene, forces, nodes), -1 if greatest else 0)
     lower = free_block(tangent(nodes.xi, nodes.sections, nodes.tau(forces)), scene.free)
     root = jnp.sqrt(c.join(free_components(nodes.sections.stiffness, scene.free)))
@@ -75,13 +85,15 @@ class Arm(eqx.Module):
     """Data of the tangent of the whole arm: strain, cross-sections, thread forces and loads at the
     nodes of a grid.
 
-    `units` scales changes of the free strains, $\\Sigma^{-1/2} W^{-1/2}$ with W the weights of the
-    nodes; `taut`: see `ScaledTangent`.
+    `tau`: forces of the threads along the nodes; `forces`: at their start; `units` scales changes
+    of the free strains, $\\Sigma^{-1/2} W^{-1/2}$ with W the weights of the nodes; `taut`: see
+    `ScaledTangent`.
     """
 
     xi: Vector
     sections: CrossSections
     tau: Vector
+    forces: Vector
     loads: Loading
     grid: Grid
     units: Float[Array, "strains stages steps"]
@@ -95,7 +107,7 @@ class Arm(eqx.Module):
             lower,
             self.units,
             self.grid.weight,
-            _along(self.xi, self.grid, self.loads),
+            _along(self.xi, self.grid, self.loads, self.forces),
             self.taut,
             self.free,
         )
@@ -105,7 +117,8 @@ class Arm(eqx.Module):
         compiles faster than that of the operator."""
 
         def imbalance(xi: Vector) -> Vector:
-            wrench = stacked.components(react(xi, self.grid, self.loads).wrench)
+            along = react(xi, self.grid, self.loads, self.forces)
+            wrench = stacked.components(along.wrench)
             return residual(xi, self.sections, self.tau, wrench)
 
         x = spread(tuple(self.units * _projected(v, self.units, self.taut)), self.free)
@@ -143,7 +156,8 @@ class _Along(NamedTuple):
     derivative of the load density by the motion of its section; `points`; `turn`: derivative of the
     rotation from the start of each step to its nodes, and in the last row of the whole step, with
     respect to the angular strains (component and stage) at the nodes of the step; `beyond`: matrix
-    that takes values at the nodes to their integrals from each node to the tip.
+    that takes values at the nodes to their integrals from each node to the tip; `ends`, `pull`: of
+    the chords of straight tendons, as `Slopes` and `Reaction` have them.
     """
 
     rotation: Float[Array, "3 3 stages steps"]
@@ -154,6 +168,8 @@ class _Along(NamedTuple):
     points: tuple[_PointSlope, ...]
     turn: Float[Array, "strains 3 rows steps"]
     beyond: Float[Array, "nodes nodes"]
+    ends: Float[Array, "6 motion steps"] | None
+    pull: Pull | None
 
 
 class ScaledTangent(Operator):
@@ -211,27 +227,35 @@ def arm_of(scene: Scene, forces: Vector, nodes: Nodes) -> Arm:
     if sections.flexible is not None:
         there &= sections.flexible > 0
     units = jnp.where(there, 1 / jnp.sqrt(jnp.where(there, grid.weight, 1.0) * stiffness), 0.0)
+    along_sections = nodes.tau(forces)
+    if loads.discs is not None:
+        along_sections = loads.discs.elsewhere(along_sections)
     taut: list[Array] = []
     for place in scene.length_driven:
-        path, reach = sections.paths[place], sections.reach[place]
-        unit = (
-            grid.weight
-            * units
-            * jnp.stack(free_components(thread_wrench(thread_direction(xi, path)[0], path), free))
-        )
-        unit = unit if reach is None else reach * unit
+        wrench = _unit_wrench(scene, xi, nodes, place)
+        unit = grid.weight * units * jnp.stack(free_components(wrench, free))
         for other in taut:
             unit = unit - jnp.sum(other * unit) * other
         size = jnp.sum(unit**2)
         holds = (forces[place] < 0) & (size > 0)
         taut.append(jnp.where(holds, unit / jnp.sqrt(jnp.where(holds, size, 1.0)), 0.0))
-    return Arm(xi, sections, nodes.tau(forces), loads, grid, units, tuple(taut), free)
+    return Arm(xi, sections, along_sections, forces, loads, grid, units, tuple(taut), free)
 
 
-def _along(xi: Vector, grid: Grid, loads: Loading) -> _Along:
+def _unit_wrench(scene: Scene, xi: Vector, nodes: Nodes, place: int) -> Vector:
+    """Derivative of a thread's length by the strain at each node."""
+    if scene.actuators[place].straight:
+        rotation = rotations(stacked.stack(xi[:3]), nodes.grid.h, scene.rod.base)[1]
+        return chords_of(scene, xi, nodes.grid).unit(place, rotation)
+    path = nodes.sections.paths[place]
+    wrench = thread_wrench(thread_direction(xi, path)[0], path)
+    return c.times(nodes.sections.reach[place], wrench)
+
+
+def _along(xi: Vector, grid: Grid, loads: Loading, forces: Vector) -> _Along:
     """The reaction and the derivatives that its change needs."""
     steps, size = grid.h.size, grid.X.size
-    now = react(xi, grid, loads)
+    now = react(xi, grid, loads, forces)
     unit = jnp.eye(size, dtype=grid.h.dtype).reshape(1, *grid.X.shape, size)
     (integral,) = beyond(unit, grid._replace(h=grid.h[:, None]))
     slopes = slopes_of(now, loads)
@@ -248,6 +272,8 @@ def _along(xi: Vector, grid: Grid, loads: Loading) -> _Along:
         points,
         _turns(stacked.stack(xi[:3]), grid, now),
         integral.reshape(size, size),
+        slopes.ends,
+        now.pull,
     )
 
 
@@ -311,4 +337,18 @@ def _reaction_change(x: Array, along: _Along) -> Array:
     if along.density is not None or along.points:
         density = density + cross(p, moved[3:])
     change = moved + jnp.concatenate([dm + integral(density), dn])
+    if along.pull is not None:
+        shift = jnp.sum(along.weight * moving, axis=1) @ before
+        change = change + _chord_change(starts, shift, along.pull, along.ends)
     return stacked.turned(stacked.transpose(along.rotation), change)
+
+
+def _chord_change(theta: Array, shift: Array, pull: Pull, ends: Array | None) -> Array:
+    """Change of the wrench of straight tendons on the nodes, in the world frame, less that by the
+    displacement of the nodes, from the motions of the starts of the steps and the tip."""
+    springs = jnp.sum(pull.across(pull.turned(theta, shift), cut=False), axis=1)
+    if ends is None:
+        return springs
+    at_ends = jnp.sum(ends[:, :3] * theta[:, 1:], axis=1)
+    later = jnp.cumsum(at_ends[:, ::-1], axis=1)[:, ::-1]
+    return springs + later[:, None]

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..arm.discs import on_chords, points_at
 from ..typing import VectorLike
 from ..validation import choice
 from .quantities import QUANTITIES, AlongArm, Quantity, Solved, abscissas
@@ -104,7 +105,17 @@ def _summary(eq: Solved, X: Array, names: tuple[str, ...]) -> Summary:
     ]
     threads = jnp.stack(paths, axis=1) if paths else jnp.zeros((X.size, 0, 2), X.dtype)
     carried = [_carried(along["pose"], yz) for yz in (threads, wall)]
-    return Summary(X, along, jnp.swapaxes(carried[0], 0, 1), carried[1], _values(eq, names))
+    lines = jnp.swapaxes(carried[0], 0, 1)
+    for i in eq.scene.straight:
+        lines = lines.at[i].set(jnp.where(jnp.isnan(lines[i]), jnp.nan, _chords(eq, i, X)))
+    return Summary(X, along, lines, carried[1], _values(eq, names))
+
+
+def _chords(eq: Solved, place: int, X: Array) -> Array:
+    """Points [m] of a straight tendon at abscissas X."""
+    actuator = eq.scene.actuators[place]
+    holes = actuator.holes(eq.scene.rod.length)
+    return on_chords(points_at(actuator, holes, eq.value("pose")(holes)), holes, X)
 
 
 def _place(path: Any) -> Array:

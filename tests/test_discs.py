@@ -1,0 +1,247 @@
+"""Tendons that run straight from disc to disc."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import central_differences, epsilon
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+import vsr_jax as vsr
+from vsr_jax.files.scene_file import parse_scene, to_toml
+
+LENGTH, RADIUS, YOUNG = 0.3, 0.01, 1e6
+ARM = vsr.Rod(LENGTH, vsr.Circular(RADIUS), vsr.Material(YOUNG, poisson=0.45, density=1000.0))
+EI = YOUNG * np.pi / 4 * RADIUS**4
+STEPS, FINE = vsr.StrainDependent(12), vsr.StrainDependent(36)
+TENSIONS = jnp.array([3.0, 2.0])
+PATHS = vsr.Parallel(0.007, 0.0), vsr.Helix(0.007, pitch=0.4, phase=2.0)
+
+
+def scene(loads=(), **options):
+    return vsr.Scene(ARM, [vsr.Tendon(path, **options) for path in PATHS], loads)
+
+
+@pytest.fixture(scope="module")
+def weighed():
+    """An arm with gravity and two tendons through three discs."""
+    return vsr.solve(scene([vsr.Gravity()], discs=3), TENSIONS, model=FINE, throw=True)
+
+
+def planar_segment(tension, offset, length):
+    """Pose (x, y, angle) at the end of an inextensible piece between two discs, by shooting for the
+    direction of the chord: $EI \\theta' = T (r - p) \\times e$ with p the first hole."""
+
+    def end(angle):
+        along = np.cos(angle), np.sin(angle)
+
+        def rate(_, state):
+            x, y, theta = state
+            moment = x * along[1] - (y - offset) * along[0]
+            return np.cos(theta), np.sin(theta), tension / EI * moment
+
+        return solve_ivp(rate, (0, length), (0, 0, 0), rtol=1e-12, atol=1e-14).y[:, -1]
+
+    def aside(angle):
+        x, y, theta = end(angle)
+        hole = x - offset * np.sin(theta), y + offset * (np.cos(theta) - 1)
+        return hole[1] * np.cos(angle) - hole[0] * np.sin(angle)
+
+    return end(brentq(aside, -0.2, 1.5, xtol=1e-14))
+
+
+@pytest.mark.parametrize(("discs", "tension"), [(1, 0.4), (3, 4.0)])
+def test_an_arm_in_a_plane_is_that_of_a_separate_integration(discs, tension):
+    arm = vsr.Scene(
+        ARM, [vsr.Tendon(vsr.Parallel(0.007, 0.0), discs=discs)], free_strains=["bending_z"]
+    )
+    eq = vsr.solve(arm, [tension], model=vsr.StrainDependent(24), throw=True)
+    x, y, angle = planar_segment(tension, 0.007, LENGTH / discs)
+    place, turned = np.zeros(2), 0.0
+    for _ in range(discs):
+        c, s = np.cos(turned), np.sin(turned)
+        place = place + np.array([c * x - s * y, s * x + c * y])
+        turned += angle
+    assert turned > 0.15
+    np.testing.assert_allclose(eq.tip[:2, 3], place, atol=1e-8)
+    chord = np.hypot(x - 0.007 * np.sin(angle), y + 0.007 * (np.cos(angle) - 1))
+    np.testing.assert_allclose(eq.lengths, [discs * chord], rtol=1e-8)
+
+
+@pytest.mark.parametrize("discs", [1, 3])
+def test_a_central_tendon_buckles_the_arm_between_its_discs(discs):
+    r"""At $T = \pi^2 EI / s^2$, with sines between discs at distance s and the margin $1 - T s^2 /
+    (\pi^2 EI)$. A tendon along the section never does."""
+    critical = np.pi**2 * EI / (LENGTH / discs) ** 2
+    names = ["bending_y", "bending_z"]
+    arm = vsr.Scene(ARM, [vsr.Tendon(vsr.Parallel(0.0, 0.0), discs=discs)], free_strains=names)
+    eq = vsr.solve(arm, [0.98 * critical], model=STEPS, throw=True)
+    np.testing.assert_allclose(eq.stability, 0.02, atol=1e-5)
+    np.testing.assert_allclose(eq.tip[:3, 3], [LENGTH, 0, 0], atol=1e-12)
+    beyond = vsr.solve(arm, [1.02 * critical], model=STEPS)
+    assert beyond.status == vsr.Status.UNSTABLE
+    along = vsr.Scene(ARM, [vsr.Tendon(vsr.Parallel(0.0, 0.0))], free_strains=names)
+    assert vsr.solve(along, [1.02 * critical], model=STEPS).converged
+
+
+def test_many_discs_approach_the_path_at_second_order():
+    usual = vsr.solve(scene(), TENSIONS / 3, model=vsr.StrainDependent(20), throw=True)
+    errors = []
+    for discs in (5, 10, 20):
+        eq = vsr.solve(scene(discs=discs), TENSIONS / 3, model=vsr.StrainDependent(20), throw=True)
+        errors.append(np.linalg.norm(eq.tip[:3, 3] - usual.tip[:3, 3]))
+    orders = np.log2(np.divide(errors[:-1], errors[1:]))
+    np.testing.assert_allclose(orders, 2.0, atol=0.1)
+
+
+def test_few_steps_between_discs_converge_with_their_order():
+    fine = vsr.solve(scene(discs=3), TENSIONS, model=vsr.StrainDependent(48), throw=True)
+    errors = []
+    for steps in (3, 6, 12):
+        eq = vsr.solve(scene(discs=3), TENSIONS, model=vsr.StrainDependent(steps), throw=True)
+        errors.append(np.linalg.norm(eq.tip[:3, 3] - fine.tip[:3, 3]))
+    assert np.all(np.log2(np.divide(errors[:-1], errors[1:])) > 5.0), errors
+
+
+def test_the_derivative_of_the_energy_by_a_tension_is_the_sum_of_chords(weighed):
+    def energy(change):
+        return vsr.solve(weighed.scene, TENSIONS + 1e-2 * change, model=FINE).energy.total
+
+    slope = central_differences(energy, 2) / 1e-2
+    np.testing.assert_allclose(slope, weighed.lengths, rtol=1e-9)
+
+
+def test_lengths_give_back_the_tensions(weighed):
+    driven = scene([vsr.Gravity()], discs=3, control="length")
+    changes = weighed.lengths - jnp.array([driven.rest_length(i) for i in range(2)])
+    eq = vsr.solve(driven, changes, model=FINE, throw=True)
+    np.testing.assert_allclose(-eq.forces, TENSIONS, rtol=1e-9)
+    np.testing.assert_allclose(eq.tip, weighed.tip, atol=1e-10)
+    loose = vsr.solve(driven, changes.at[1].set(0.03), model=STEPS, throw=True)
+    assert loose.forces[1] == 0
+    np.testing.assert_allclose(
+        loose.slack[1], driven.rest_length(1) + 0.03 - loose.lengths[1], rtol=1e-9
+    )
+
+
+def test_a_tendon_is_drawn_as_chords(weighed):
+    corners = weighed.thread(1, jnp.array([0.0, 0.1, 0.2, 0.3]))
+    lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
+    np.testing.assert_allclose(np.sum(lengths), weighed.lengths[1], rtol=1e-7)
+    between = weighed.thread(1, jnp.array([0.125]))
+    np.testing.assert_allclose(between[0], 0.75 * corners[1] + 0.25 * corners[2], atol=1e-12)
+    drawn = weighed.summary(jnp.array([0.0, 0.125, 0.3])).threads
+    np.testing.assert_allclose(drawn[1, 1], between[0], atol=1e-12)
+
+
+def test_the_reaction_is_that_to_the_loads(weighed):
+    """The chords pull on both ends of an arm: the reaction at the base is the weight alone."""
+    weight = 1000.0 * np.pi * RADIUS**2 * LENGTH * 9.81
+    np.testing.assert_allclose(weighed.reaction(0.0)[3:], [0, 0, -weight], rtol=1e-4, atol=1e-9)
+
+
+PLACED = [0.08, 0.19]
+
+
+def coordinate(p):
+    """A number of a loaded arm by five others: two tensions, two discs, the offset of a tendon."""
+    tendons = [
+        vsr.Tendon(vsr.Parallel(p[4], 0.0), disc_places=p[2:4], end=0.25),
+        vsr.Tendon(PATHS[1], discs=3),
+    ]
+    force = vsr.TipWrench(force=(0.0, 0.05, -0.1))
+    eq = vsr.solve(vsr.Scene(ARM, tendons, [force]), p[:2], model=vsr.StrainDependent(8))
+    return eq.tip[:3, 3] @ jnp.array([1.0, -2.0, 3.0])
+
+
+def test_gradients_in_both_modes_are_finite_differences():
+    p, scale = jnp.array([3.0, 2.0, *PLACED, 0.007]), jnp.array([1e-2, 1e-2, 1e-3, 1e-3, 1e-4])
+    forward, reverse = jax.jit(lambda p: (jax.jacfwd(coordinate)(p), jax.grad(coordinate)(p)))(p)
+    solve = jax.jit(coordinate)
+    differences = central_differences(lambda unit: solve(p + scale * unit), 5)
+    np.testing.assert_allclose(forward * scale, differences, rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-8)
+    assert np.all(np.abs(forward) > 1e-4)
+
+
+@pytest.mark.parametrize("loads", [(), (vsr.Gravity(),)])
+def test_a_batch_is_its_arms(loads):
+    arm = scene(loads, discs=3)
+
+    def tip(inputs):
+        return vsr.solve(arm, inputs, model=vsr.StrainDependent(6)).tip[:3, 3]
+
+    inputs = jnp.array([[3.0, 2.0], [0.0, 0.0], [1.0, 4.0]])
+    np.testing.assert_allclose(
+        jax.vmap(tip)(inputs), jnp.stack([tip(x) for x in inputs]), atol=1e-10
+    )
+
+
+def test_precision_is_that_of_the_inputs(dtype):
+    exact = vsr.solve(scene(discs=3), TENSIONS, model=STEPS, throw=True)
+    eq = vsr.solve(scene(discs=3), TENSIONS.astype(dtype), model=STEPS, throw=True)
+    assert eq.tip.dtype == dtype
+    np.testing.assert_allclose(eq.tip[:3, 3], exact.tip[:3, 3], atol=50 * epsilon(dtype))
+
+
+def test_places_of_even_discs_are_their_number():
+    by_number = vsr.solve(scene(discs=3), TENSIONS, model=FINE, throw=True)
+    by_places = vsr.solve(scene(disc_places=[0.1, 0.2]), TENSIONS, model=FINE, throw=True)
+    np.testing.assert_allclose(by_places.tip, by_number.tip, atol=1e-7)
+    assert scene(discs=3).edges().size == 4  # shared by both tendons
+    none = vsr.solve(scene(disc_places=[]), TENSIONS / 10, model=STEPS, throw=True)
+    one = vsr.solve(scene(discs=1), TENSIONS / 10, model=STEPS, throw=True)
+    np.testing.assert_allclose(none.tip, one.tip, atol=1e-12)
+
+
+def test_a_slack_tendon_with_discs_does_nothing():
+    straight = vsr.solve(scene([vsr.Gravity()], discs=3), [0.0, 0.0], model=STEPS, throw=True)
+    bare = vsr.solve(vsr.Scene(ARM, loads=[vsr.Gravity()]), [], model=STEPS, throw=True)
+    np.testing.assert_allclose(straight.tip, bare.tip, atol=1e-8)
+
+
+def test_scene_files_keep_discs():
+    tendons = [vsr.Tendon(PATHS[0], discs=4), vsr.Tendon(PATHS[1], disc_places=PLACED)]
+    arm = vsr.Scene(ARM, tendons)
+    text = to_toml(arm)
+    assert "discs = 4" in text
+    read = parse_scene(text).scene
+    assert repr(read) == repr(arm)
+    assert read.effects == ("tendons", "sections", "discs")
+    even, placed = read.actuators
+    assert isinstance(even, vsr.Tendon)
+    assert isinstance(placed, vsr.Tendon)
+    assert even.discs == 4
+    np.testing.assert_array_equal(placed.disc_places, PLACED)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"discs": 0}, "Tendon.discs: got 0, need an integer >= 1"),
+        ({"discs": 2, "disc_places": [0.1]}, "need one of the two"),
+        ({"discs": 2, "friction": 0.1}, "Tendon.friction: got 0.1 with discs"),
+        ({"disc_places": 0.1}, r"Tendon.disc_places: got shape \(\)"),
+        ({"disc_places": [0.2, 0.1]}, "Tendon.disc_places: got .*, need ascending abscissas"),
+        ({"disc_places": [0.2], "end": 0.15}, "Tendon.disc_places: got .*, need ascending"),
+        ({"disc_places": [-0.1]}, "Tendon.disc_places: got .*, need finite numbers > 0"),
+    ],
+)
+def test_wrong_discs_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        vsr.Tendon(PATHS[0], **options)
+
+
+def test_discs_beyond_the_arm_are_refused():
+    message = r"Scene.actuators\[0\].disc_places: got 0.1 to 0.4 m, need ascending abscissas"
+    with pytest.raises(ValueError, match=message):
+        scene(disc_places=[0.1, 0.4])
+
+
+@pytest.mark.parametrize(
+    "model", [vsr.Prescribed(vsr.Basis.uniform(vsr.Legendre(2))), vsr.Continuum()]
+)
+def test_other_models_name_the_one_for_discs(model):
+    with pytest.raises(ValueError, match=r"actuators\[0\].discs.*need StrainDependent"):
+        vsr.solve(scene(discs=3), TENSIONS, model=model)
