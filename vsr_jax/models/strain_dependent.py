@@ -93,9 +93,10 @@ class StrainDependent(SteppedModel):
 
     def memory(self, near: Near) -> tuple[Coupling, ...]:
         """The couplings of a solution by this model, with the memory of it."""
-        state, grid = near.state, self.grid(near.scene)
-        loads = loading(near.scene, grid) if near.scene.straight else None  # others do not count
-        sections = near.scene.sections(grid.X)
+        state, scene, grid = near.state, near.scene, self.grid(near.scene)
+        counts = scene.straight or scene.held or scene.obstacles  # loads do not
+        loads = loading(scene, grid) if counts else None
+        sections = scene.sections(grid.X)
         old = ArmProblem(grid, sections, near.forces, loads, state.couplings)
         at = state_of(state.xi, state.coupled, old)
         return tuple(
