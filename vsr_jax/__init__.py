@@ -109,7 +109,17 @@ if TYPE_CHECKING:
     from .optimization import constraint, objective
     from .optimization.design_search import Design, design
     from .optimization.search import Search
-    from .solution import Energy, Equilibrium, Error, Plan, SolveError, Summary, plan, solve
+    from .solution import (
+        Contact,
+        Energy,
+        Equilibrium,
+        Error,
+        Plan,
+        SolveError,
+        Summary,
+        plan,
+        solve,
+    )
     from .viewer.page import View, view
     from .viz import annotate, plot, plot_design, plot_fit
     from .viz.animation import film
@@ -125,6 +135,7 @@ __all__ = [
     "Circular",
     "Comparison",
     "Constant",
+    "Contact",
     "Continuum",
     "CrossValidation",
     "Curvatures",

@@ -167,9 +167,8 @@ def _pushed(eq: Equilibrium, wrench: Float[Array, "6"]) -> Equilibrium:
     """The equilibrium with an additional wrench on the tip."""
     loads = (*eq.scene.loads, TipWrench(wrench[3:], wrench[:3]))
     old = eq.scene
-    scene = Scene(
-        old.rod, old.actuators, loads, free_strains=old.free_strains, obstacles=old.obstacles
-    )
+    around = {"held": old.held, "obstacles": old.obstacles}
+    scene = Scene(old.rod, old.actuators, loads, free_strains=old.free_strains, **around)
     return solve(scene, eq.inputs, model=eq.model)
 
 

@@ -3,6 +3,7 @@
 Must not import code that needs several solves; that code is in `analysis`.
 """
 
+from .bearing import Contact
 from .energy import Energy
 from .equilibrium import Equilibrium
 from .estimate import Error
@@ -13,6 +14,7 @@ from .summary import Summary
 
 __all__ = [
     "QUANTITIES",
+    "Contact",
     "Energy",
     "Equilibrium",
     "Error",

@@ -119,8 +119,8 @@ class Row(NamedTuple):
 
     @property
     def at_point(self) -> bool:
-        """Whether the load acts at one place."""
-        return len(self.places) == 1
+        """Whether the load acts at points, not per length."""
+        return not self.unit.endswith("/m")
 
     @property
     def color(self) -> str:
@@ -145,7 +145,8 @@ class Row(NamedTuple):
 
 
 def rows_of(eq: Equilibrium) -> list[Row]:
-    """Forces and moments of the loads of an equilibrium, without those that are zero."""
+    """Forces and moments of the loads, supports and contacts of an equilibrium, without those that
+    are zero."""
     return rows_from_wrenches(eq.scene, wrenches_of(eq))
 
 
@@ -155,28 +156,49 @@ Acting = tuple[Array, Array]
 
 
 def wrenches_of(eq: Equilibrium) -> list[Acting]:
-    """Where and how each load of an equilibrium acts; `jax.jit` goes through it."""
-    rod, loads = eq.scene.rod, eq.scene.loads
-    if not loads:
-        return []
-    along = jnp.linspace(0, 1, _STATIONS) * rod.length
-    X = [along if (x := load.place(rod)) is None else x[None] for load in loads]
-    ends = np.cumsum([x.size for x in X])[:-1]
-    poses = jnp.split(eq.pose(jnp.concatenate(X)), ends)
-    return [
-        (pose, _wrench(load, rod, x, pose)) for load, x, pose in zip(loads, X, poses, strict=True)
-    ]
+    """Where and how each load, each held section and each obstacle of an equilibrium acts;
+    `jax.jit` goes through it."""
+    rod, loads, held = eq.scene.rod, eq.scene.loads, eq.scene.held
+    found = []
+    if loads or held:
+        along = jnp.linspace(0, 1, _STATIONS) * rod.length
+        X = [along if (x := load.place(rod)) is None else x[None] for load in loads]
+        X += [one.place(rod)[None] for one in held]
+        ends = np.cumsum([x.size for x in X])[:-1]
+        poses = jnp.split(eq.pose(jnp.concatenate(X)), ends)
+        placed = list(zip(X, poses, strict=True))
+        for load, (x, pose) in zip(loads, placed, strict=False):
+            found.append((pose, _wrench(load, rod, x, pose)))
+        supports = eq.supports
+        for i, (_, pose) in enumerate(placed[len(loads) :]):
+            found.append((pose, supports[i][None]))
+    if eq.scene.obstacles:
+        contacts = eq.contacts
+        pushes = contacts.force[..., None] * contacts.normal
+        wrenches = jnp.concatenate([jnp.zeros_like(pushes), pushes], axis=-1)
+        poses = jnp.zeros((*contacts.X.shape, 4, 4), wrenches.dtype)
+        found += list(zip(poses.at[..., :3, 3].set(contacts.position), wrenches, strict=True))
+    return found
 
 
 def rows_from_wrenches(scene: Scene, wrenches: Sequence[Acting]) -> list[Row]:
-    """The loads of a scene from their `wrenches_of`, without those that are zero."""
+    """Loads, supports and contacts of a scene from their `wrenches_of`, without those that are
+    zero."""
+    named = [(x.effects[0], "" if x.place(scene.rod) is not None else "/m") for x in scene.loads]
+    named += [("support", "") for _ in scene.held]
+    named += [(f"contact with {obstacle.effect}", "") for obstacle in scene.obstacles]
     found = []
-    for load, (pose, wrench) in zip(scene.loads, jax.tree.map(np.asarray, wrenches), strict=True):
-        per_length = "" if load.place(scene.rod) is not None else "/m"
+    for (name, per), (pose, wrench) in zip(named, jax.tree.map(np.asarray, wrenches), strict=True):
         for unit, vectors in (("N", wrench[:, 3:]), ("N m", wrench[:, :3])):
-            row = Row(load.effects[0], unit + per_length, pose[:, :3, 3], vectors)
+            size = np.linalg.norm(vectors, axis=-1)
+            there = size > _SHOWN * np.max(size, initial=0.0)
+            row = Row(name, unit + per, pose[there, :3, 3], vectors[there])
             found += [row] if row.greatest > 0 else []
     return found
+
+
+_SHOWN = 1e-6
+"""Share of the greatest wrench of a load above which it is drawn at a place."""
 
 
 def _wrench(load: Load, rod: Rod, X: Array, poses: Array) -> Array:
