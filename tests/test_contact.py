@@ -74,16 +74,43 @@ def test_a_clamped_elastica_has_the_force_of_the_elliptic_integrals():
 
 
 def test_held_sections_have_exact_derivatives():
-    def height(shortened, mode):
+    def height(shortened):
         end = vsr.Held(position=jnp.array([1.0, 0, 0]) * L * (1 - shortened))
         scene = vsr.Scene(rod(), (), [vsr.TipWrench(moment=(0, 0.01, 0))], held=end)
         return vsr.solve(scene, NO_INPUTS, model=MODEL).position(L / 2)[2]
 
     h, at = 1e-5, 0.1
-    difference = (height(at + h, 0) - height(at - h, 0)) / (2 * h)
-    np.testing.assert_allclose(jax.grad(height)(at, 0), difference, rtol=1e-6)
-    forward = jax.jvp(lambda x: height(x, 0), (at,), (1.0,))[1]
+    difference = (height(at + h) - height(at - h)) / (2 * h)
+    np.testing.assert_allclose(jax.grad(height)(at), difference, rtol=1e-6)
+    forward = jax.jvp(height, (at,), (1.0,))[1]
     np.testing.assert_allclose(forward, difference, rtol=1e-6)
+
+
+def test_a_clamp_within_the_arm_is_the_wrench_that_it_exerts():
+    """A turned clamp at 0.12 m, on a base that is turned too; the free arm under the support
+    reaction as a dead wrench."""
+    turned = vsr.pose((0.11, 0.02, -0.03), pointing=(0.8, 0.3, -0.4), roll=0.2)
+    base = vsr.pose((0.01, 0.0, 0.02), pointing=(1.0, 0.2, 0.1))
+    arm = vsr.Rod(L, vsr.Circular(0.005), vsr.Material(1e6, poisson=0.3, density=1000.0), base=base)
+    hold = vsr.Held(0.12, position=turned[:3, 3], orientation=turned)
+    eq = solved(vsr.Gravity(), held=hold, arm=arm)
+    np.testing.assert_allclose(eq.pose(0.12), turned, atol=1e-9)
+    moment, force = eq.supports[0, :3], eq.supports[0, 3:]
+    assert float(jnp.linalg.norm(moment)) > 1e-4
+    free = solved(
+        vsr.Gravity(), vsr.PointWrench(0.12, force=force, moment=moment), arm=arm, start=eq
+    )
+    np.testing.assert_allclose(free.tip, eq.tip, atol=1e-8)
+
+
+def test_the_margin_of_a_held_arm_can_be_differentiated():
+    def margin(push):
+        end = vsr.Held(position=jnp.array([L, 0, 0.0]), along=(1, 0, 0))
+        load = vsr.TipWrench(force=jnp.array([-1.0, 0, 0]) * push)
+        return solved(load, held=end, free_strains=BENDING).stability
+
+    euler = 20.190728556426629 * stiffness() / L**2
+    np.testing.assert_allclose(jax.grad(margin)(0.3 * euler), -1 / euler, rtol=1e-5)
 
 
 SPHERE = vsr.Sphere((0.1, 0.012, -0.03), 0.02)
@@ -122,6 +149,24 @@ def test_a_touching_arm_is_the_free_arm_under_its_contact_force(pressed):
     np.testing.assert_allclose(base, whole, atol=1e-12)
 
 
+def test_a_solve_may_start_from_the_free_arm(pressed):
+    free = solved(vsr.TipWrench(force=(0, 0.005, -0.005)))
+    np.testing.assert_allclose(
+        solved(PRESS, obstacles=SPHERE, start=free).tip, pressed.tip, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        solved(PRESS, obstacles=SPHERE, start=pressed).tip, pressed.tip, atol=1e-9
+    )
+
+
+def test_the_force_jumps_at_the_contact(pressed):
+    contacts = pressed.contacts
+    at = int(jnp.argmax(contacts.force[0]))
+    X, force = contacts.X[0, at], contacts.force[0, at] * contacts.normal[0, at]
+    sides = [pressed.pose(x)[:3, :3] @ pressed.reaction(x)[3:] for x in (X - 1e-5, X + 1e-5)]
+    np.testing.assert_allclose(sides[0] - sides[1], force, atol=1e-6)
+
+
 def test_contact_has_exact_derivatives_and_batches(pressed):
     def height(radius, force):
         obstacle = vsr.Sphere((0.1, 0.012, -0.03), radius)
@@ -139,6 +184,7 @@ def test_contact_has_exact_derivatives_and_batches(pressed):
     many = jax.vmap(lambda force: height(0.02, force))(jnp.array([0.0, 0.01, 0.03]))
     np.testing.assert_allclose(many[2], pressed.tip[2, 3], atol=1e-10)
     np.testing.assert_allclose(many[1], height(0.02, 0.01), atol=1e-10)
+    assert abs(float(many[0])) < 1e-3  # 5 mN aside alone
 
 
 def test_a_heavy_arm_lies_on_the_floor():

@@ -92,7 +92,8 @@ def _by_numbers(eq: Equilibrium) -> tuple[Array, Array, Array]:
     numbers = {name: parameter.value for name, parameter in parameters(eq.scene).items()}
 
     def motion(numbers: dict[str, Array], inputs: Array) -> Array:
-        return _motion(solve(replaced(eq.scene, numbers), inputs, model=eq.model).tip, eq.tip)
+        scene = replaced(eq.scene, numbers)
+        return _motion(solve(scene, inputs, model=eq.model, start=_near(eq)).tip, eq.tip)
 
     by_numbers, by_inputs = jax.jacrev(motion, argnums=(0, 1))(numbers, eq.inputs)
     rows = jnp.concatenate(
@@ -121,11 +122,11 @@ def tip_jacobian(eq: Equilibrium) -> Float[Array, "6 inputs"]:
 
 @eqx.filter_jit
 def _by_inputs(eq: Equilibrium) -> Array:
-    return eq.masked(
-        jax.jacfwd(lambda inputs: _motion(solve(eq.scene, inputs, model=eq.model).tip, eq.tip))(
-            eq.inputs
-        )
-    )
+    def motion(inputs: Array) -> Array:
+        found = solve(eq.scene, inputs, model=eq.model, start=_near(eq))
+        return _motion(found.tip, eq.tip)
+
+    return eq.masked(jax.jacfwd(motion)(eq.inputs))
 
 
 def compliance(eq: Equilibrium) -> Float[Array, "6 6"]:
@@ -133,8 +134,8 @@ def compliance(eq: Equilibrium) -> Float[Array, "6 6"]:
     small dead wrench on the tip, in the world's axes.
 
     Without loads, for models that are `balanced_everywhere`, $C = \int G^T (\Sigma - A)^{-1} G \,
-    dX$, where G transforms the wrench to the frames of the sections. With loads, given lengths or
-    friction, and for all other models, the derivative of the solve with an additional `TipWrench`.
+    dX$, where G transforms the wrench to the frames of the sections. Where the sections are coupled,
+    and for all other models, the derivative of the solve with an additional `TipWrench`.
 
     **Arguments:** `eq`: one solved scene; the result is NaN where it failed.
 
@@ -169,7 +170,12 @@ def _pushed(eq: Equilibrium, wrench: Float[Array, "6"]) -> Equilibrium:
     old = eq.scene
     around = {"held": old.held, "obstacles": old.obstacles}
     scene = Scene(old.rod, old.actuators, loads, free_strains=old.free_strains, **around)
-    return solve(scene, eq.inputs, model=eq.model)
+    return solve(scene, eq.inputs, model=eq.model, start=_near(eq))
+
+
+def _near(eq: Equilibrium) -> Equilibrium | None:
+    """Where a solve near by starts: an arm that is held or touches may have several equilibria."""
+    return eq if eq.scene.held or eq.scene.obstacles else None
 
 
 def _carried(g: Pose, tip: Pose) -> Float[Array, "6 6"]:

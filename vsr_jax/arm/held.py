@@ -73,12 +73,6 @@ class Held(Part):
         first = first / jnp.sqrt(jnp.sum(first**2))
         return jnp.stack([first, jnp.cross(a, first)], axis=1)
 
-    @property
-    def rows(self) -> int:
-        """Number of components that are held."""
-        of_position = 0 if self.position is None else 3 if self.along is None else 2
-        return of_position + (0 if self.orientation is None else 3)
-
 
 def _rotation(value: MatrixLike) -> Float[Array, "3 3"]:
     whole = jnp.asarray(value)

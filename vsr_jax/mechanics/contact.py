@@ -31,6 +31,7 @@ from ..numerics.quadrature import Grid, locate
 from ..numerics.se3 import base_pose
 from .coupling import SOFTENED, ArmProblem, ArmState, Border, Coupling
 from .held import of_forces
+from .pose_terms import finite
 from .reaction import Loading
 from .sizes import softest
 from .touch import Surroundings, Touch
@@ -46,8 +47,8 @@ _TOGETHER = 24
 """Contacts whose forces are solved for together in one step of Newton's method, at most."""
 
 _FLATNESS, _FLATTER = 0.5, 0.5
-"""How far the nearest point of a step may be from the least gap, as a fraction of the outline over
-the square of the number of steps, and of the width of penalties."""
+"""Bound on the excess of the gap at the nearest point of a step over the least one, as a fraction
+of the outline over the square of the number of steps, and of the width of penalties."""
 
 
 class Contacts(Coupling):
@@ -71,7 +72,8 @@ class Contacts(Coupling):
     softens = True
 
     def relaxed(self) -> "Contacts":
-        return replace(self, lift=self.lift + 1e3 * self.rod.length)
+        obstacles, rod = finite((self.obstacles, self.rod))
+        return replace(self, obstacles=obstacles, rod=rod, lift=self.lift + 1e3 * rod.length)
 
     def softened(self, hardness: Array) -> "Contacts":
         soft = (hardness < SOFTENED).astype(self.scale.dtype)
@@ -79,6 +81,9 @@ class Contacts(Coupling):
         flatness = jnp.where(soft > 0, jnp.maximum(self.flatness, _FLATTER * width), self.flatness)
         blur = (_BLUR ** jnp.clip(hardness, 0.25, 1.0) * self.rod.length).astype(self.scale.dtype)
         return replace(self, soft=soft, width=width, flatness=flatness, blur=blur)
+
+    def like(self, other: Coupling) -> bool:
+        return isinstance(other, Contacts) and len(self.obstacles) == len(other.obstacles)
 
     def guess(self, forces: Forces, grid: Grid) -> Float[Array, "contacts ..."]:
         size = len(self.obstacles) * self.steps
@@ -180,7 +185,8 @@ class Contacts(Coupling):
         return 1 / root, root
 
     def radians(self, problem: ArmProblem) -> Array:
-        return 1 / (self.scale * problem.length)
+        size = len(self.obstacles) * self.steps
+        return jnp.broadcast_to(1 / (self.scale * problem.length), (size,))
 
 
 _COMPLIANCE = 1e-6

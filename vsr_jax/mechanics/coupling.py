@@ -33,7 +33,7 @@ from .balance import without_force
 from .reaction import Loading, Reaction
 
 HARDENING = HARDENING_STAGES / LOAD_INCREMENTS
-"""Fraction of the loads, in increments of a solve, by which constraints harden."""
+"""By what the fraction of the loads exceeds 1 where constraints are exact."""
 
 SOFTENED = (SOFT_STAGES - 0.5) / HARDENING_STAGES
 """Hardness from which constraints have no energy."""
@@ -242,6 +242,10 @@ class Coupling(eqx.Module):
         r"""Its unknowns, where it `follows_rate`, from the strain and the derivative $(\xi -
         \xi^*)'$ along the arm, which models with a basis know."""
         raise NotImplementedError
+
+    def like(self, other: "Coupling") -> bool:
+        """Whether the unknowns of another coupling can start its own."""
+        return type(self) is type(other)
 
     def moved(self, x: PyTree, X: Array, grid: Grid) -> PyTree:
         """Its unknowns on another grid than that with the nodes X; unchanged by default."""

@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..arm.held import Held
@@ -40,7 +41,7 @@ from ..numerics.stacked import (
 )
 from ..typing import Scalar
 from .coupling import SOFTENED, ArmProblem, ArmState, Border, Coupling
-from .pose_terms import PoseTerm
+from .pose_terms import PoseTerm, finite
 from .reaction import Loading, Reaction, rotation_at, rotations
 from .sizes import shape_of, softest
 
@@ -105,10 +106,15 @@ class Holds(Coupling):
     softens = True
 
     def relaxed(self) -> "Holds":
-        return replace(self, share=jnp.zeros_like(self.share))
+        return replace(finite(self), share=jnp.zeros_like(self.share))
 
     def softened(self, hardness: Array) -> "Holds":
         return replace(self, soft=(hardness < SOFTENED).astype(self.scale.dtype))
+
+    def like(self, other: Coupling) -> bool:
+        if not isinstance(other, Holds):
+            return False
+        return [one.rows for one in self.holds] == [one.rows for one in other.holds]
 
     def guess(self, forces: Forces, grid: Grid) -> Float[Array, "components ..."]:
         return jnp.zeros((len(self.scale), *grid.h.shape[1:]), grid.h.dtype)
@@ -164,8 +170,8 @@ class Holds(Coupling):
     def sizes(self, x: Array, at: ArmState, problem: ArmProblem) -> list[Array]:
         length, sizes = problem.length, []
         for hold, part in zip(self.holds, self._parts(x), strict=True):
-            wrench = hold.wrench(part)[:, None, None]
-            moment = rows_of(wrench, 0, 3) + length * rows_of(wrench, 3, 6)
+            wrench = jnp.abs(hold.wrench(part))[:, None, None]
+            moment = rows_of(wrench, 0, 3) + length * jnp.sum(rows_of(wrench, 3, 6), axis=0)
             whole = (*components(moment), *components(rows_of(wrench, 3, 6)))
             sizes.append(shape_of(whole, problem.sections, length))
         return sizes
@@ -179,7 +185,7 @@ class Holds(Coupling):
         return 1 / root, root
 
     def radians(self, problem: ArmProblem) -> Array:
-        return self.lengths / (self.scale * problem.length**2)
+        return 1 / (self.scale * self.lengths)
 
     @property
     def _stiff(self) -> Array:
@@ -188,8 +194,7 @@ class Holds(Coupling):
 
     def _parts(self, x: Array) -> list[Array]:
         """The entries of each section."""
-        ends = [sum(sum(one.rows) for one in self.holds[: i + 1]) for i in range(len(self.holds))]
-        return [x[end - sum(hold.rows) : end] for hold, end in zip(self.holds, ends, strict=True)]
+        return jnp.split(x, np.cumsum([sum(hold.rows) for hold in self.holds])[:-1])
 
     def _deviation(self, hold: Hold, along: Reaction, grid: Grid) -> list[Array]:
         axes, found = along.axis.ndim - 3, []

@@ -7,7 +7,8 @@ m(X) = \sum_{X_i > X} M_i + \int_X^L (c + p' \times n) \, ds, \quad
 \Lambda = (R^T m, R^T n).$$
 
 Two passes along the arm: rotations from the base to the tip, wrenches from the tip to the base.
-Positions are computed only if a load depends on them. Wrenches jump only at the ends of steps.
+Positions are computed only if a load depends on them. Wrenches jump only at the ends of steps, but
+for contact forces (see `touch`).
 """
 
 from collections.abc import Callable
@@ -409,6 +410,11 @@ def react_at(xi: Vector, grid: Grid, loads: Loading, X: Array, forces: Forces = 
     first = float(gauss_legendre(grid.X.shape[0])[0][0])
     since, q = along.world[:, 0, step], along.density
     world = since + within(q, grid, step, first) - within(q, grid, step, sigma)
+    touch = along.touch
+    if touch is not None:  # a contact force acts before its place, not by its share of the node
+        before = (sigma < touch.sigma[:, step]) - touch.shares[0][:, step]
+        forces_there = (touch.force * touch.normal)[:, :, step]
+        world = world.at[3:].add(jnp.sum(before * forces_there, axis=1))
     return components(turned(transpose(R), world))
 
 

@@ -11,7 +11,7 @@ there is $g = d(r) - \rho$. Without friction the contact force is $\lambda n$ wi
 
 The position r(s) is an integral of the axis with weights $a_j(s)$ for the nodes of the step. A
 force at s acts on node j with the share $a_j(s) / a_j(1)$, so that its work is that of the discrete
-positions: the balance with contact forces is the gradient of a discrete energy.
+positions: but for $\epsilon$ the balance is the gradient of a discrete energy.
 """
 
 from collections.abc import Callable
@@ -69,11 +69,12 @@ class Touch(NamedTuple):
 
 
 class _Nearest(NamedTuple):
-    """The nearest point of one step: place in the step, gap, normal, position, and the matrix of
-    `Touch.slope` per force."""
+    """The nearest point of one step: place in the step, gap there without and with the term in
+    epsilon, normal, position, and the matrix of `Touch.slope` per force."""
 
     sigma: Array
     gap: Array
+    raised: Array
     normal: Array
     place: Array
     slope: Array
@@ -91,14 +92,17 @@ def touch_of(axis: Array, grid: Grid, around: Surroundings) -> Touch:
         for obstacle in around.obstacles
     ]
     near = jax.tree.map(lambda *x: jnp.stack(x, axis=x[0].ndim - starts.ndim + 1), *found)
-    gap = near.gap + around.lift
+    # empty steps, all at one place, touch nothing
+    lift = around.lift + jnp.where(grid.h > 0, 0.0, 1e3 * around.rod.length)
+    gap = near.gap + lift
     force, slope = around.force.reshape(gap.shape), near.slope
     if around.soft is None or around.width is None:
         slope = force * slope
     else:
-        root = jnp.sqrt(gap**2 + around.width**2)
-        penalty = 0.5 * around.stiffness * (root - gap)
-        rate = 0.5 * around.stiffness * (gap / root - 1)
+        raised = near.raised + lift
+        root = jnp.sqrt(raised**2 + around.width**2)
+        penalty = 0.5 * around.stiffness * (root - raised)
+        rate = 0.5 * around.stiffness * (raised / root - 1)
         force = jnp.where(around.soft > 0, penalty, force)
         push = jnp.where(around.soft > 0, rate, 0.0) * near.normal[:, None] * near.normal[None]
         slope = (force * slope).at[3:, 3:].add(push)
@@ -170,7 +174,7 @@ def _nearest(
     bend = jax.jacfwd(jax.grad(obstacle.distance))(r)
     moved = jnp.concatenate([jnp.cross(along, normal), turn])
     slope = -jnp.where(inside, 1 / curvature, 0.0) * moved[:, None] * moved[None]
-    return _Nearest(s, gap(s), normal, r, slope.at[3:, 3:].add(bend))
+    return _Nearest(s, gap(s), lifted(s), normal, r, slope.at[3:, 3:].add(bend))
 
 
 def _each(

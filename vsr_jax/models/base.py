@@ -199,7 +199,8 @@ class Model(eqx.Module):
         """Another solution, from which the error of the given one is estimated; by default that of
         the `finer` model."""
         grid, finer = make_grid(scene.edges(), 32, 3), self.finer()
-        found, X = finer.solve(scene, inputs), grid.X.reshape(-1)
+        near = Near(self, scene, forces, state)
+        found, X = finer.solve_from(scene, inputs, near), grid.X.reshape(-1)
         return Refinement(
             finer.tip(scene, found.forces, found.state),
             X,

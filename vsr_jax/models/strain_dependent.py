@@ -180,10 +180,17 @@ class StrainDependent(SteppedModel):
     def unknowns_on(
         self, scene: Scene, forces: Forces, state: ArmSolution, problem: ArmProblem
     ) -> ArmUnknown:
-        X = self.grid(scene).X
-        pairs = zip(problem.couplings, state.coupled, strict=True)
-        coupled = tuple(coupling.moved(x, X, problem.grid) for coupling, x in pairs)
-        return ArmUnknown(self.strain_on(scene, forces, state, problem.grid), coupled)
+        X, grid = self.grid(scene).X, problem.grid
+        found = list(zip(state.couplings, state.coupled, strict=True))
+
+        def begun(new: Coupling) -> Any:
+            for old, x in found:
+                if new.like(old):
+                    return new.moved(x, X, grid)
+            return new.guess(forces, grid)
+
+        coupled = tuple(map(begun, problem.couplings))
+        return ArmUnknown(self.strain_on(scene, forces, state, grid), coupled)
 
     def strain(
         self, scene: Scene, forces: Forces, state: ArmSolution, X: Float[Array, " stations"]

@@ -21,8 +21,8 @@ LOAD_INCREMENTS = 5
 """Increments in which `damped_newton` applies the loads where they cannot be applied at once: the
 tangent is often indefinite at the start under all loads."""
 SOFT_STAGES, HARDENING_STAGES = 2, 8
-"""Increments after the loads by which constraints become exact in `damped_newton`, and the first of
-them, which have an energy."""
+"""Number of increments after the loads with springs in place of constraints, which have an energy,
+and of all by which constraints harden in `damped_newton`."""
 MAX_TURN = 1.5
 """Bound on the angle [rad] by which one step of a loaded solve bends and twists the arm. A step
 that coils the arm may lower the residual without approaching a solution."""
@@ -136,6 +136,8 @@ def damped_newton(
       includes $\rho^2 / (1 - \rho)$ of the last one, the remainder of the geometric series.
     - Acceleration, with `measures.dot`. Near the solution, steps that shrink linearly, as with
       friction, and not quadratically are replaced by those of `accelerated`.
+    - Stages. The stages of constraints without an energy accept every finite step, undamped; one
+      that goes back by half of the last one is halved.
     - Probing. Where the tangent is doubtful at the end, the arm is moved from the solution by the
       last step, made small, and creeps: $s_{n+1} = s_n + (H + \mu \Sigma)^{-1} r(x - s_n)$. The
       solution is unstable if the motion grows after some steps.

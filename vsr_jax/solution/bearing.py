@@ -76,7 +76,8 @@ class Supported(eqx.Module):
 
     def form(self, v: Array) -> Array:
         """$v^T S v$ with S the scaled tangent."""
-        return jnp.sum(v * self.times(self.allowed(v)))
+        x = self.allowed(v)
+        return jnp.sum(x * self.times(x))
 
     def times(self, v: Array) -> Array:
         """The scaled tangent, where the wrenches of supports and contacts keep their sizes."""
@@ -125,6 +126,8 @@ def supported(problem: ArmProblem, unknown: ArmUnknown, free: tuple[int, ...]) -
     grid, stiffness = problem.grid, problem.sections.stiffness
     scale = jnp.stack([jnp.broadcast_to(s, grid.X.shape) for s in free_components(stiffness, free)])
     there = grid.weight > 0
+    if problem.sections.flexible is not None:
+        there &= problem.sections.flexible > 0
     units = jnp.where(there, 1 / jnp.sqrt(jnp.where(there, grid.weight, 1.0) * scale), 0.0)
     at = state_of(unknown.xi, unknown.coupled, problem)
     ties = []

@@ -131,7 +131,8 @@ class Equilibrium(Solved):
 
         The matrix is $\Sigma^{-1/2} (\Sigma - A) \Sigma^{-1/2}$ at each node. Where loads couple
         the nodes, it is the symmetric part of the whole tangent, scaled the same way and restricted
-        to the changes of strain that taut cables of given length allow.
+        to the changes of strain that held sections, contacts that push and taut cables of given
+        length allow.
 
         The margin is 1 for an arm without forces, at least 1 for tendons alone up to rounding, and
         0 where the equilibrium loses stability. Loads without a potential (dead moments in space,
