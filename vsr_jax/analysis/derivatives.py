@@ -134,8 +134,8 @@ def compliance(eq: Equilibrium) -> Float[Array, "6 6"]:
     small dead wrench on the tip, in the world's axes.
 
     Without loads, for models that are `balanced_everywhere`, $C = \int G^T (\Sigma - A)^{-1} G \,
-    dX$, where G transforms the wrench to the frames of the sections. Where the sections are coupled,
-    and for all other models, the derivative of the solve with an additional `TipWrench`.
+    dX$, where G transforms the wrench to the frames of the sections. Where the sections are
+    coupled, and for all other models, the derivative of the solve with an additional `TipWrench`.
 
     **Arguments:** `eq`: one solved scene; the result is NaN where it failed.
 
