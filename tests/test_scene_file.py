@@ -215,8 +215,8 @@ MISTAKES = [
     (
         "[rod]",
         "[road]",
-        r"^unknown key 'road', known are actuators, free_strains, inputs, loads, obstacles, rod, "
-        r"title; did you mean 'rod'\?$",
+        r"^unknown key 'road', known are actuators, free_strains, held, inputs, loads, obstacles, "
+        r"rod, title; did you mean 'rod'\?$",
     ),
     (
         '"Circular"',

@@ -131,7 +131,7 @@ def _extreme(arm: Arm | Supported, place: int) -> Array:
 
 
 @partial(_extreme.defjvp, symbolic_zeros=True)
-def _extreme_jvp(place: int, primals: tuple[Arm], tangents: tuple[Arm]) -> tuple[Array, Array]:
+def _extreme_jvp(place: int, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     values, vectors = extreme_pairs(primals[0].tangent())
     return values[place], change_of(lambda arm: arm.form(vectors[place]), primals, tangents)
 
