@@ -66,9 +66,9 @@ class Contacts(Coupling):
     flatness: Array
     lift: Array
     blur: Array
+    steps: int = eqx.field(static=True)
     soft: Array | None = None
     width: Array | None = None
-    steps: int = eqx.field(static=True, default=0)
     softens = True
 
     def relaxed(self) -> "Contacts":
@@ -178,7 +178,7 @@ class Contacts(Coupling):
 
     def row_sizes(self, rows: Array, at: ArmState, problem: ArmProblem) -> list[Array]:
         """Gaps and deflections by forces, per length of the arm."""
-        return [rows / (self.scale * problem.length)]
+        return self.sizes(rows, at, problem)
 
     def units(self, problem: ArmProblem) -> tuple[Array, Array]:
         root = jnp.sqrt(self.scale)
@@ -210,5 +210,5 @@ def contacts_of(scene: Scene, sections: CrossSections, grid: Grid) -> Contacts |
         flatness,
         jnp.zeros_like(length),
         _BLUR * length,
-        steps=grid.h.shape[0],
+        grid.h.shape[0],
     )

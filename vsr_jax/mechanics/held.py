@@ -27,7 +27,7 @@ from ..arm.rod import Rod
 from ..arm.scene import CrossSections, Scene
 from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import Grid, before_point, beyond, sum_along
-from ..numerics.se3 import base_pose, rotation_vector, stacked_rotation
+from ..numerics.se3 import base_pose, rotation_vector
 from ..numerics.stacked import (
     components,
     cross,
@@ -41,7 +41,7 @@ from ..numerics.stacked import (
 )
 from ..typing import Scalar
 from .coupling import SOFTENED, ArmProblem, ArmState, Border, Coupling
-from .pose_terms import PoseTerm, finite
+from .pose_terms import PoseTerm, base_of, finite
 from .reaction import Loading, Reaction, rotation_at, rotations
 from .sizes import shape_of, softest
 
@@ -51,24 +51,30 @@ _SPRING = 1e3
 
 class Hold(NamedTuple):
     """A held section: its abscissa, the number of steps before it and 1 at the nodes before it; the
-    held directions (3, n), the position (3,) in which it is held, None if it may move, and that at
-    rest; the rotation vector (3,) from its rotation at rest to that in which it is held, None if it
-    may turn, and the rotation at rest (3, 3)."""
+    held directions (3, n) and the position (3,) in which it is held, None if it may move; the
+    orientation (3, 3) in which it is held, None if it may turn; both at rest."""
 
     X: Array
     step: Array
     before: Array
     directions: Array | None
     position: Array | None
+    orientation: Array | None
     rest: Array
-    turn: Array | None
     rotation: Array
 
     @property
     def rows(self) -> tuple[int, int]:
         """Number of forces and of moments."""
         forces = 0 if self.directions is None else self.directions.shape[1]
-        return forces, 0 if self.turn is None else 3
+        return forces, 0 if self.orientation is None else 3
+
+    def at_rest(self) -> "Hold":
+        """The section held in its pose at rest."""
+        return self._replace(
+            position=None if self.position is None else self.rest,
+            orientation=None if self.orientation is None else self.rotation,
+        )
 
     def force(self, x: Array) -> Array:
         """Wrench (6, ...) of the force for the unknowns of this section."""
@@ -92,8 +98,7 @@ class Holds(Coupling):
 
     **Fields:** `holds`; the `rod` and the position of its `base`; `scale`, the stiffnesses that
     scale deviations to forces and moments, and `lengths`, those that scale them to numbers, one per
-    component; `share`: 1, or 0 to hold the sections in their poses at rest; `soft`: 1 where springs
-    stand for the constraints.
+    component; `soft`: 1 where springs stand for the constraints.
     """
 
     holds: tuple[Hold, ...]
@@ -101,12 +106,11 @@ class Holds(Coupling):
     base: Array
     scale: Array
     lengths: Array
-    share: Array
     soft: Array | None = None
     softens = True
 
     def relaxed(self) -> "Holds":
-        return replace(finite(self), share=jnp.zeros_like(self.share))
+        return replace(finite(self), holds=tuple(hold.at_rest() for hold in self.holds))
 
     def softened(self, hardness: Array) -> "Holds":
         return replace(self, soft=(hardness < SOFTENED).astype(self.scale.dtype))
@@ -125,13 +129,13 @@ class Holds(Coupling):
         pairs = zip(self.holds, self._parts(x), self._parts(self.scale), strict=True)
         for hold, part, scale in pairs:
             part = part if soft is None else (1 - soft) * part
-            forces, moments = hold.rows
+            forces, _ = hold.rows
             if forces:
                 force = hold.before * hold.force(part)[:, None, None]
                 dead = force if dead is None else dead + force
-            if moments:
-                moment = HoldingMoment(part[forces:], self._orientation(hold))
-                terms.append(PoseTerm(moment, self.rod, jnp.ones_like(self.share), *hold[:3]))
+            if hold.orientation is not None:
+                moment = HoldingMoment(part[forces:], hold.orientation)
+                terms.append(PoseTerm(moment, self.rod, jnp.ones_like(scale[0]), *hold[:3]))
             if soft is not None:
                 terms.append(PoseTerm(self._spring(hold, scale), self.rod, soft, *hold[:3]))
         return loads._replace(dead=dead, by_pose=(*loads.by_pose, *terms))
@@ -198,31 +202,22 @@ class Holds(Coupling):
 
     def _deviation(self, hold: Hold, along: Reaction, grid: Grid) -> list[Array]:
         axes, found = along.axis.ndim - 3, []
-        if hold.directions is not None:
+        if hold.directions is not None and hold.position is not None:
             position = base_of(self.base, axes) + sum_along(hold.before * along.axis, grid)[:, 0, 0]
-            found.append(matvec(transpose(hold.directions), position - self._position(hold)))
-        if hold.turn is not None:
+            found.append(matvec(transpose(hold.directions), position - hold.position))
+        if hold.orientation is not None:
             R = rotation_at(along.starts, along.end, hold.step)
             vector = rotation_vector
             for _ in range(axes):
                 vector = jax.vmap(vector, -1, -1)
-            found.append(vector(matmul(R, transpose(self._orientation(hold)))))
+            found.append(vector(matmul(R, transpose(hold.orientation))))
         return found
 
-    def _position(self, hold: Hold) -> Array:
-        assert hold.position is not None
-        return hold.rest + self.share * (hold.position - hold.rest)
-
-    def _orientation(self, hold: Hold) -> Array:
-        assert hold.turn is not None
-        return matmul(stacked_rotation(self.share * hold.turn), hold.rotation)
-
     def _spring(self, hold: Hold, scale: Array) -> "HoldingSpring":
-        forces, moments = hold.rows
         return HoldingSpring(
             hold.directions,
-            self._position(hold) if forces else None,
-            self._orientation(hold) if moments else None,
+            hold.position,
+            hold.orientation,
             _SPRING * scale[0],
             _SPRING * scale[-1],
         )
@@ -294,11 +289,6 @@ def of_forces(world: Array, along: Reaction, grid: Grid) -> Vector:
     return components(jnp.moveaxis(jax.vmap(one)(world), 1, 0))
 
 
-def base_of(base: Array, axes: int) -> Array:
-    """Position of the base with axes of arms."""
-    return base.reshape(3, *base.shape[1:], *(1,) * (axes + 1 - base.ndim))
-
-
 def holds_of(scene: Scene, sections: CrossSections, grid: Grid) -> Holds | None:
     """The held sections of a scene; None if it has none."""
     if not scene.held:
@@ -312,10 +302,10 @@ def holds_of(scene: Scene, sections: CrossSections, grid: Grid) -> Holds | None:
         X = held.place(scene.rod)
         step, before = before_point(grid, X)
         rotation = rotation_at(starts, end, step)
-        target = held.orientation
-        turn = None if target is None else rotation_vector(matmul(target, transpose(rotation)))
         place = base[:3, 3] + sum_along(before * axis, grid)[:, 0, 0]
-        return Hold(X, step, before, held.directions(), held.position, place, turn, rotation)
+        return Hold(
+            X, step, before, held.directions(), held.position, held.orientation, place, rotation
+        )
 
     holds, length = tuple(map(hold, scene.held)), jnp.sum(grid.h)
     units = [
@@ -326,4 +316,4 @@ def holds_of(scene: Scene, sections: CrossSections, grid: Grid) -> Holds | None:
     lengths = jnp.stack(units)
     bending = jnp.sum(grid.weight * softest(sections.stiffness))
     scale = 3 * bending / (length * lengths) ** 2
-    return Holds(holds, scene.rod, base[:3, 3], scale, lengths, jnp.ones_like(length))
+    return Holds(holds, scene.rod, base[:3, 3], scale, lengths)

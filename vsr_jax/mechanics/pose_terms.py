@@ -106,6 +106,11 @@ def pose_terms(scene: Scene, grid: Grid) -> tuple[PoseTerm, ...]:
     return tuple(terms)
 
 
+def base_of(base: Array, axes: int) -> Array:
+    """Position (3, ...) of the base with as many axes of arms, of size 1 where they are missing."""
+    return base.reshape(3, *base.shape[1:], *(1,) * (axes + 1 - base.ndim))
+
+
 def finite(tree: Any) -> Any:
     """Zero in place of all numbers that are not finite."""
     return jax.tree.map(lambda x: jnp.where(jnp.isfinite(x), x, jnp.zeros_like(x)), tree)

@@ -48,7 +48,7 @@ from ..numerics.stacked import (
     turned,
 )
 from .chords import Discs, Pull, discs_of, pull_of
-from .pose_terms import PoseTerm, finite, pose_terms
+from .pose_terms import PoseTerm, base_of, finite, pose_terms
 from .touch import Surroundings, Touch, at_ends, contact_forces, touch_of
 
 
@@ -320,7 +320,7 @@ def _seen(
         return ()
     positions = loads.motion == 6
     base = jnp.asarray(base_pose(loads.base, grid.h.dtype))[:3, 3]
-    base = base.reshape(3, 1, 1, *base.shape[1:], *(1,) * (axis.ndim - 2 - base.ndim))
+    base = base_of(base, axis.ndim - 3)[:, None, None]
     along = any(term.step is None for term in loads.by_pose)
     nodes = base + before(axis, grid) if positions and along else None
     seen = []

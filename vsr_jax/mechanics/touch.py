@@ -26,6 +26,7 @@ from ..arm.obstacles import Obstacle
 from ..arm.rod import Rod
 from ..numerics.batching import arms_in
 from ..numerics.quadrature import Grid, gauss_legendre, interpolation
+from .pose_terms import base_of
 
 _SAMPLES, _ITERATIONS = 5, 6
 """Points of a step from which the nearest one starts, and Newton steps from it."""
@@ -83,9 +84,7 @@ class _Nearest(NamedTuple):
 def touch_of(axis: Array, grid: Grid, around: Surroundings) -> Touch:
     """Contact for the axis p' at the nodes, shape (3, stages, steps, *arms)."""
     parts = jnp.sum(grid.weight * axis, axis=1)
-    base = around.base.reshape(
-        3, 1, *around.base.shape[1:], *(1,) * (parts.ndim - 1 - around.base.ndim)
-    )
+    base = base_of(around.base, parts.ndim - 2)[:, None]
     starts = base + jnp.cumsum(parts, axis=1) - parts
     found = [
         _each(_nearest, obstacle, around.rod, around.flatness, starts, axis, grid.start, grid.h)

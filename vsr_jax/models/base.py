@@ -159,8 +159,15 @@ class Model(eqx.Module):
         """The coupled balance at a solution of a scene with held sections or obstacles."""
         raise ValueError(f"model: got {type(self).__name__}, need StrainDependent")
 
-    def refuse_constraints(self, scene: Scene) -> None:
-        """Raises `ValueError` for a scene with held sections or obstacles."""
+    def refuse_whole_arm(self, scene: Scene) -> None:
+        """Raises `ValueError` for a scene with held sections, obstacles or tendons with discs,
+        which only the balance of the whole arm by `StrainDependent` has."""
+        if scene.straight:
+            raise ValueError(
+                f"scene.actuators[{scene.straight[0]}].discs: got a tendon that runs straight from "
+                f"disc to disc and {type(self).__name__}, need StrainDependent, the model for such "
+                f"tendons"
+            )
         found = "held sections" if scene.held else "obstacles" if scene.obstacles else None
         if found:
             raise ValueError(
@@ -314,16 +321,6 @@ def resolved(model: Model, scene: Scene, outcome: Outcome) -> Outcome:
     return outcome._replace(
         status=jnp.where(coarse, Status.UNDER_RESOLVED, outcome.status).astype(jnp.int32)
     )
-
-
-def refuse_straight(scene: Scene, model: Model) -> None:
-    """Raises `ValueError` for tendons with discs, for models of threads along the sections."""
-    if scene.straight:
-        raise ValueError(
-            f"scene.actuators[{scene.straight[0]}].discs: got a tendon that runs straight from "
-            f"disc to disc and {type(model).__name__}, need StrainDependent, the model for such "
-            f"tendons"
-        )
 
 
 def classify(

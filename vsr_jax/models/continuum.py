@@ -27,7 +27,7 @@ from ..numerics.quadrature import locate, make_grid
 from ..numerics.se3 import coad, hat, inverse
 from ..typing import Pose, Scalar, Twist
 from ..validation import count, instance, positive
-from .base import Model, Nodes, Outcome, Status, classify, refuse_straight
+from .base import Model, Nodes, Outcome, Status, classify
 from .shooting import Control, Guess, ShootingUnknown, Shot, integrate, shoot, wrench_scale
 from .strain_dependent import StrainDependent
 
@@ -86,7 +86,8 @@ class Continuum(Model):
     - `derivative`: the model that computes derivatives. For shooting it also gives the initial
       guess, and the tensions by thread lengths and friction.
 
-    **Raises:** `ValueError` on solving a scene whose tendons run straight from disc to disc.
+    **Raises:** `ValueError` on solving a scene with held sections or obstacles, or whose tendons
+    run straight from disc to disc.
     """
 
     solver: diffrax.AbstractSolver = eqx.field(static=True)
@@ -120,8 +121,7 @@ class Continuum(Model):
         )
 
     def solve(self, scene: Scene, inputs: Float[Array, " inputs"]) -> Outcome:
-        self.refuse_constraints(scene)
-        refuse_straight(scene, self)
+        self.refuse_whole_arm(scene)
         tip, forces, status, steps = _tip(self, scene, inputs)
         return Outcome(Found(tip, inputs), forces, status, steps)
 

@@ -32,7 +32,7 @@ from ..numerics.quadrature import make_grid, onto
 from ..typing import Scalar
 from ..validation import ROUNDING, choice, count, instance, on_arm
 from . import prescribed_loaded
-from .base import Nodes, Outcome, Status, SteppedModel, classify, refuse_straight
+from .base import Nodes, Outcome, Status, SteppedModel, classify
 from .basis import AbstractBasis
 from .prescribed_loaded import solve_prescribed
 
@@ -141,8 +141,8 @@ class Prescribed(SteppedModel):
       With loads, prescribed thread lengths or friction the quadrature is that of the pose steps.
     - `steps`, `order`: pose steps as for `StrainDependent`.
 
-    **Raises:** `ValueError` on solving a scene that locks a strain which the basis frees, or whose
-    tendons run straight from disc to disc.
+    **Raises:** `ValueError` on solving a scene that locks a strain which the basis frees, that has
+    held sections or obstacles, or whose tendons run straight from disc to disc.
     """
 
     basis: AbstractBasis
@@ -162,9 +162,8 @@ class Prescribed(SteppedModel):
         return self.basis.breakpoints(scene.rod.length)
 
     def solve(self, scene: Scene, inputs: Float[Array, " inputs"]) -> Outcome:
-        refuse_straight(scene, self)
+        self.refuse_whole_arm(scene)
         self.basis.check(scene, type(self).__name__)
-        self.refuse_constraints(scene)
         if scene.coupled:
             return self._solve_together(scene, inputs)
         projection, forces = project(scene, self.basis, self.points), scene.forces(inputs)

@@ -27,7 +27,7 @@ from ..mechanics.balance import (
     without_force,
 )
 from ..mechanics.coupling import ArmProblem, Coupling, forces_at
-from ..mechanics.reaction import Loading, loading, react_at
+from ..mechanics.reaction import Loading, react_at
 from ..numerics.component import Forces, Vector
 from ..numerics.magnus import ORDERS
 from ..numerics.quadrature import Grid
@@ -93,15 +93,11 @@ class StrainDependent(SteppedModel):
 
     def memory(self, near: Near) -> tuple[Coupling, ...]:
         """The couplings of a solution by this model, with the memory of it."""
-        state, scene, grid = near.state, near.scene, self.grid(near.scene)
-        counts = scene.straight or scene.held or scene.obstacles  # loads do not
-        loads = loading(scene, grid) if counts else None
-        sections = scene.sections(grid.X)
-        old = ArmProblem(grid, sections, near.forces, loads, state.couplings)
-        at = state_of(state.xi, state.coupled, old)
+        old, unknown = self.balance(near.scene, near.forces, near.state)
+        at = state_of(unknown.xi, unknown.coupled, old)
         return tuple(
             coupling.after(x, at, old)
-            for coupling, x in zip(state.couplings, state.coupled, strict=True)
+            for coupling, x in zip(old.couplings, unknown.coupled, strict=True)
         )
 
     def at_rest(self, scene: Scene, dtype: Any) -> Near:

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..arm.scene import CrossSections
 from ..mechanics.arm_balance import ArmUnknown, imbalance_of, state_of
 from ..mechanics.balance import free_components, spread
 from ..mechanics.coupling import ArmProblem
@@ -15,6 +16,7 @@ from ..mechanics.held import Holds
 from ..numerics import lu
 from ..numerics.component import Vector
 from ..numerics.lanczos import Operator
+from ..numerics.quadrature import Grid
 from ..typing import DTypeLike
 
 
@@ -121,14 +123,23 @@ class SupportedTangent(Operator):
         return self.allowed(0.5 * (self.arm.times(v) + back(v)[0]))
 
 
+def units_of(
+    sections: CrossSections, grid: Grid, free: tuple[int, ...]
+) -> Float[Array, "strains stages steps"]:
+    r"""Units of changes of the free strains, $\Sigma^{-1/2} W^{-1/2}$ with W the weights of the
+    nodes; zero on rigid pieces and at nodes of zero weight, where nothing changes."""
+    stiffness = jnp.stack(
+        [jnp.broadcast_to(s, grid.X.shape) for s in free_components(sections.stiffness, free)]
+    )
+    there = grid.weight > 0
+    if sections.flexible is not None:
+        there &= sections.flexible > 0
+    return jnp.where(there, 1 / jnp.sqrt(jnp.where(there, grid.weight, 1.0) * stiffness), 0.0)
+
+
 def supported(problem: ArmProblem, unknown: ArmUnknown, free: tuple[int, ...]) -> Supported:
     """The arm of a solution with what holds it."""
-    grid, stiffness = problem.grid, problem.sections.stiffness
-    scale = jnp.stack([jnp.broadcast_to(s, grid.X.shape) for s in free_components(stiffness, free)])
-    there = grid.weight > 0
-    if problem.sections.flexible is not None:
-        there &= problem.sections.flexible > 0
-    units = jnp.where(there, 1 / jnp.sqrt(jnp.where(there, grid.weight, 1.0) * scale), 0.0)
+    grid, units = problem.grid, units_of(problem.sections, problem.grid, free)
     at = state_of(unknown.xi, unknown.coupled, problem)
     ties = []
     for coupling, x, note in zip(problem.couplings, unknown.coupled, at.notes, strict=True):

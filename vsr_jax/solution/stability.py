@@ -52,7 +52,7 @@ from ..numerics.lanczos import Operator, extreme_pairs
 from ..numerics.quadrature import Grid, beyond, gauss_legendre
 from ..numerics.se3 import exp_coefficients, stacked_rotation
 from ..numerics.stacked import cross
-from .bearing import Supported
+from .bearing import Supported, units_of
 
 
 def extreme_supported(arm: Supported, *, greatest: bool = False) -> Array:
@@ -220,13 +220,7 @@ def arm_of(scene: Scene, forces: Vector, nodes: Nodes) -> Arm:
     loads = loading(scene, grid)
     assert loads is not None
     xi = tuple(jnp.broadcast_to(x, grid.X.shape) for x in nodes.xi)
-    stiffness = jnp.stack(
-        [jnp.broadcast_to(s, grid.X.shape) for s in free_components(sections.stiffness, free)]
-    )
-    there = grid.weight > 0
-    if sections.flexible is not None:
-        there &= sections.flexible > 0
-    units = jnp.where(there, 1 / jnp.sqrt(jnp.where(there, grid.weight, 1.0) * stiffness), 0.0)
+    units = units_of(sections, grid, free)
     along_sections = nodes.tau(forces)
     if loads.discs is not None:
         along_sections = loads.discs.elsewhere(along_sections)
