@@ -24,10 +24,10 @@ from vsr_jax.studies.timing import Timed, machine, primitives, take_turns
 jax.config.update("jax_enable_x64", True)
 
 MODEL, BATCH = vsr.StrainDependent(24), 128
-PILLAR = vsr.Sphere((0.1, 0.012, -0.03), 0.02)
+PILLAR = vsr.Cylinder(0.02, pose=vsr.pose((0.1, 0.0, -0.03), pointing=(0.0, 1.0, 0.0)))
 
 
-def obstacles() -> dict[str, list[vsr.Sphere]]:
+def obstacles() -> dict[str, list[vsr.Sphere | vsr.Cylinder]]:
     """Obstacles by the name of the case; those that are far are never touched."""
     far = [vsr.Sphere((0.05 * i, 0.3, 0.0), 0.02) for i in range(10)]
     return {
@@ -38,7 +38,7 @@ def obstacles() -> dict[str, list[vsr.Sphere]]:
     }
 
 
-def tip(around: list[vsr.Sphere], force: jax.Array) -> tuple[jax.Array, jax.Array]:
+def tip(around: list[vsr.Sphere | vsr.Cylinder], force: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Height of the tip and Newton steps for a force down [N]."""
     rod = vsr.Rod(0.2, vsr.Circular(0.005), vsr.Material(1e6, poisson=0.3, density=1000.0))
     load = vsr.TipWrench(force=jnp.stack([0.0 * force, 0.005 + 0.0 * force, -force]))
@@ -59,10 +59,10 @@ def main() -> None:
     jobs, sizes = {}, {}
     for name, around in obstacles().items():
 
-        def one(force: jax.Array, around: list[vsr.Sphere] = around) -> Any:
+        def one(force: jax.Array, around: Any = around) -> Any:
             return tip(around, force)
 
-        def slope(force: jax.Array, around: list[vsr.Sphere] = around) -> jax.Array:
+        def slope(force: jax.Array, around: Any = around) -> jax.Array:
             return jax.grad(lambda force: tip(around, force)[0])(force)
 
         sizes[name] = sum(primitives(jax.make_jaxpr(one)(force)).values())

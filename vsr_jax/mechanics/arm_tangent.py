@@ -15,10 +15,10 @@ from ..numerics.component import Vector
 from ..typing import cast
 from .arm_balance import ArmImbalance, ArmUnknown, state_of
 from .balance import free_components, spread, tangent
-from .coupling import ArmProblem, ArmState, bordered_solve, borders_of
+from .coupling import ArmProblem, ArmState, bordered_solve, borders_of, points_of
 from .elimination import eliminate
 from .elimination_nodes import Definiteness
-from .pose_elimination import eliminate_poses
+from .pose_elimination import eliminate_poses, motions
 from .reaction import slopes_of
 from .sizes import node_weight
 from .springs import with_springs
@@ -46,12 +46,12 @@ def approximate_solve(
     and whether that is doubtful.
 
     In single precision: the passes along the arm are bound by memory, and rounding is far below the
-    error of the elimination. Straight tendons of an arm with loads keep the precision of the
-    unknowns: their forces without their turning, which the elimination takes first, are large
-    enough to make its pivots singular.
+    error of the elimination. Two keep the precision of the unknowns: straight tendons of an arm
+    with loads, whose forces without their turning, which the elimination takes first, are large
+    enough to make its pivots singular, and contacts, which are nearly rigid.
     """
     loads = at.loads
-    if loads is None or loads.discs is None or loads.only_discs:
+    if loads is None or (loads.around is None and (loads.discs is None or loads.only_discs)):
         unknown, at, right, problem, damping = c.single(
             (unknown, at, right, problem, jnp.asarray(damping))
         )
@@ -69,26 +69,32 @@ def approximate_solve(
         if pull is not None and loads.only_discs:
             slopes = slopes._replace(ends=pull.cut_slopes(slopes.motion), joined=pull.joined)
 
-    def solve(b: Vector, /) -> tuple[Vector, Definiteness]:
+    points = points_of(problem, unknown.coupled, at)
+    pushes = [one.pushes(right.coupled[place]) for place, one in points.items()]
+    if slopes is not None and slopes.cells is not None:
+        slopes = slopes._replace(cells=slopes.cells + sum(one.slopes() for one in points.values()))
+
+    def solve(b: Vector, *push: Array) -> tuple[Vector, Definiteness]:
         if along is not None and slopes is not None and slopes.motion == 6:
-            return eliminate_poses(lower, b, unknown.xi, along, slopes, grid, free, flexible)
+            return eliminate_poses(lower, b, unknown.xi, along, slopes, grid, free, flexible, *push)
         return eliminate(lower, b, along, slopes, grid, free, flexible)
 
     if along is not None and loads is not None and pull is not None:
         springs = pull.springs(along.rotation, cut=loads.only_discs)
         solve = with_springs(solve, springs, grid)
-    strain, (negative, doubtful) = solve(spread(right.wrench, free))
-    borders, border = borders_of(problem, unknown.coupled, at)
-    if border is None:
-        return ArmUnknown(strain, right.coupled), negative == 0, doubtful
-    parts = [one.part(right.coupled[place]) for place, one in borders.items()]
-    rows = jnp.concatenate(parts)
-    strain, x, held = bordered_solve(lambda b: solve(b)[0], strain, rows, border, grid)
-    coupled, first = list(right.coupled), 0
-    for (place, one), part in zip(borders.items(), parts, strict=True):
-        last = first + len(part)
-        coupled[place], first = one.whole(x[first:last], right.coupled[place]), last
-    return ArmUnknown(strain, tuple(coupled)), negative == held, doubtful
+    strain, (negative, doubtful) = solve(spread(right.wrench, free), *pushes)
+    coupled, (borders, border) = list(right.coupled), borders_of(problem, unknown.coupled, at)
+    if border is not None:
+        parts = [right.coupled[place] for place in borders]
+        rows = jnp.concatenate(parts)
+        strain, x, held = bordered_solve(lambda b: solve(b)[0], strain, rows, border, grid)
+        negative, first = negative - held, 0
+        for place, part in zip(borders, parts, strict=True):
+            coupled[place], first = x[first : first + len(part)], first + len(part)
+    for place, one in points.items():
+        assert along is not None
+        coupled[place] = one.change(coupled[place], motions(strain, unknown.xi, along, grid))
+    return ArmUnknown(strain, tuple(coupled)), negative == 0, doubtful
 
 
 def tangent_solve(

@@ -26,10 +26,11 @@ from jaxtyping import Array, Float
 from ..arm.obstacles import Obstacle
 from ..arm.rod import Rod
 from ..arm.scene import CrossSections, Scene
-from ..numerics.component import Forces
+from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import Grid, locate
 from ..numerics.se3 import base_pose
-from .coupling import SOFTENED, ArmProblem, ArmState, Border, Coupling
+from ..numerics.stacked import cross
+from .coupling import SOFTENED, ArmProblem, ArmState, Coupling, PointForces
 from .held import of_forces
 from .pose_terms import finite
 from .reaction import Loading
@@ -43,8 +44,9 @@ length, and by what it becomes smaller as they harden."""
 _BLUR = 1e-9
 """Length b, as a fraction of the arm's."""
 
-_TOGETHER = 24
-"""Contacts whose forces are solved for together in one step of Newton's method, at most."""
+_RIGID = 2 / 3
+"""Power of the machine epsilon that is the compliance of a contact in the approximate tangent, in
+units of 1 / k: two contacts side by side then share their force."""
 
 _FLATNESS, _FLATTER = 0.5, 0.5
 """Bound on the excess of the gap at the nearest point of a step over the least one, as a fraction
@@ -105,61 +107,40 @@ class Contacts(Coupling):
         return loads._replace(around=around)
 
     def note(self, x: Array, at: ArmState, problem: ArmProblem) -> Touch:
-        """The contacts, with one axis for obstacles and steps."""
+        """The contacts."""
         assert at.along is not None
-        touch, ends = at.along.touch, x.ndim + 1
-        assert touch is not None
-
-        def flat(a: Array) -> Array:
-            front = a.shape[: a.ndim - ends]
-            return a.reshape(*front, -1, *a.shape[a.ndim - ends + 2 :])
-
-        return Touch(*(flat(a) for a in touch))
+        assert at.along.touch is not None
+        return at.along.touch
 
     def residual(
         self, x: Array, at: ArmState, note: Touch, problem: ArmProblem, free: tuple[int, ...]
     ) -> Array:
         pushed = self.scale * note.gap
         exact = 0.5 * (note.force + pushed - self._root(note.force - pushed))
-        if self.soft is None:
-            return exact
-        return jnp.where(self.soft > 0, x - note.force, exact)
+        if self.soft is not None:
+            exact = jnp.where(self.soft > 0, x.reshape(exact.shape) - note.force, exact)
+        return exact.reshape(x.shape)
 
-    def border(self, x: Array, at: ArmState, note: Touch, problem: ArmProblem) -> Border:
-        assert at.along is not None
+    def points(self, x: Array, at: ArmState, note: Touch, problem: ArmProblem) -> PointForces:
         apart = note.force - self.scale * note.gap
         pushing = 0.5 * (1 + apart / self._root(apart))
-        hard = jnp.ones_like(x) if self.soft is None else jnp.broadcast_to(1 - self.soft, x.shape)
-        rank = note.force / self.scale - note.gap
-        size = min(_TOGETHER, x.shape[0])
-        chosen = jnp.argsort(-rank, axis=0)[:size]
+        hard = jnp.ones_like(apart) if self.soft is None else 1 - self.soft + 0 * apart
+        least = jnp.finfo(x.dtype).eps ** _RIGID
+        unit = hard * jnp.concatenate([cross(note.lever, note.normal), note.normal])
+        corner = jnp.maximum(1 - hard * pushing, least)
+        return PointForces(unit, note.cell, hard * pushing * self.scale, corner)
 
-        def of(a: Array) -> Array:
-            """Entries (..., contacts, *arms) of the chosen contacts."""
-            front = a.ndim - x.ndim
-            index = jnp.broadcast_to(chosen, (*a.shape[:front], *chosen.shape))
-            return jnp.take_along_axis(a, index, axis=front)
-
-        acts, released = of(pushing * hard), of(1 - pushing * hard)
-        step = chosen % self.steps
-        steps = jnp.arange(self.steps).reshape(1, 1, -1, *(1,) * (x.ndim - 1))
-        here = step[:, None, None]
-        shares = jnp.where(
-            steps == here, jnp.moveaxis(of(note.shares), 0, 1)[:, :, None], steps < here
-        ).astype(x.dtype)
-        normal = jnp.moveaxis(of(note.normal), 0, 1)[:, :, None, None]
-        force = shares[:, None] * normal
-        wrenches = of_forces(
-            jnp.concatenate([jnp.zeros_like(force), force], axis=1), at.along, problem.grid
-        )
-        exerted = -of(hard)[:, None, None]
-        return Border(
-            tuple(exerted * part for part in wrenches),
-            wrenches,
-            acts * self.scale,
-            jnp.maximum(released, _COMPLIANCE),
-            chosen,
-        )
+    def rows(self, at: ArmState, note: Touch, grid: Grid) -> Vector:
+        """For each contact of one arm the wrenches at the nodes whose work over a change of strain
+        is the change of its gap: six components, (contacts, stages, steps)."""
+        assert at.along is not None
+        steps = jnp.arange(self.steps)
+        here, before = jnp.eye(self.steps), steps < steps[:, None]
+        shares = jnp.where(here > 0, note.shares[..., None], before)  # (stages, obstacles, of, in)
+        force = shares[None] * note.normal[:, None, ..., None]
+        world = jnp.concatenate([jnp.zeros_like(force), force])
+        world = jnp.moveaxis(world, (2, 3), (0, 1)).reshape(-1, *world.shape[:2], self.steps)
+        return of_forces(world, at.along, grid)
 
     def moved(self, x: Array, X: Array, grid: Grid) -> Array:
         """The forces on the steps in which the middles of the old ones lie."""
@@ -187,11 +168,6 @@ class Contacts(Coupling):
     def radians(self, problem: ArmProblem) -> Array:
         size = len(self.obstacles) * self.steps
         return jnp.broadcast_to(1 / (self.scale * problem.length), (size,))
-
-
-_COMPLIANCE = 1e-6
-"""Of a contact in the approximate tangent, in units of 1 / k: two contacts side by side then share
-their force."""
 
 
 def contacts_of(scene: Scene, sections: CrossSections, grid: Grid) -> Contacts | None:

@@ -124,27 +124,45 @@ class Border(NamedTuple):
     - `rows`: R, for each row a wrench at the nodes; its work over a change of strain, times the
       factor, is the change of the row.
     - `factors`: F, shape (m, ...). `corner`: the diagonal of D, shape (m, ...).
-    - `chosen`: places among the unknowns to which the border belongs, shape (m, ...), None for all;
-      the others have the tangent 1.
     """
 
     columns: Vector
     rows: Vector
     factors: Array
     corner: Array
-    chosen: Array | None = None
 
-    def part(self, rows: Array) -> Array:
-        """The rows that the border has."""
-        return rows if self.chosen is None else jnp.take_along_axis(rows, self.chosen, axis=0)
 
-    def whole(self, x: Array, rows: Array) -> Array:
-        """All unknowns from those of the border and the rows of the others."""
-        if self.chosen is None:
-            return x
-        place = jnp.arange(len(rows)).reshape(-1, 1, *(1,) * (rows.ndim - 1)) == self.chosen[None]
-        found = jnp.sum(jnp.where(place, x[None], 0.0), axis=1)
-        return jnp.where(jnp.any(place, axis=1), found, rows)
+class PointForces(NamedTuple):
+    r"""Part of a coupling whose unknowns are forces at places of the arm, one or more per step, in
+    the tangent system: $\delta x = (s - f \, a^T z) / c$ with the motion z of the arm there and the
+    wrench a of a unit force. Springs of the stiffness $f a a^T / c$ stand for them in the
+    elimination, in place of a border.
+
+    - `wrench`: a, in the world frame at the end of a cell of a node, shape (6, n, steps, ...).
+    - `cell`: 1 for that node of the step, else 0, shape (stages, n, steps, ...).
+    - `factors`, `corner`: f and c, shape (n, steps, ...).
+    """
+
+    wrench: Array
+    cell: Array
+    factors: Array
+    corner: Array
+
+    def slopes(self) -> Array:
+        """Derivatives (6, 6, stages, steps, ...) of the wrenches by the motions."""
+        stiffness = -self.cell * self.factors / self.corner
+        return jnp.sum(stiffness * (self.wrench[:, None] * self.wrench)[:, :, None], axis=3)
+
+    def pushes(self, rows: Array) -> Array:
+        """Changes (6, stages, steps, ...) of the wrenches by given rows (n * steps, ...) alone."""
+        force = rows.reshape(self.corner.shape) / self.corner
+        return jnp.sum(self.cell * (force * self.wrench)[:, None], axis=2)
+
+    def change(self, rows: Array, motions: Array) -> Array:
+        """Changes of the unknowns for given rows and motions (6, stages, steps, ...)."""
+        there = jnp.sum(self.cell * motions[:, :, None], axis=1)
+        moved = self.factors * jnp.sum(self.wrench * there, axis=0)
+        return ((rows.reshape(moved.shape) - moved) / self.corner).reshape(rows.shape)
 
 
 class Coupling(eqx.Module):
@@ -238,6 +256,10 @@ class Coupling(eqx.Module):
         """Its part of the tangent system; none by default, for the tangent 1."""
         return None
 
+    def points(self, x: PyTree, at: ArmState, note: Any, problem: ArmProblem) -> PointForces | None:
+        """Its part of the tangent system, in place of a border; none by default."""
+        return None
+
     def from_rate(self, xi: Vector, rate: Vector, sections: CrossSections) -> PyTree:
         r"""Its unknowns, where it `follows_rate`, from the strain and the derivative $(\xi -
         \xi^*)'$ along the arm, which models with a basis know."""
@@ -279,8 +301,16 @@ def borders_of(
     found = {i: border for i, border in enumerate(each) if border is not None}
     if not found:
         return found, None
-    apart = [border._replace(chosen=None) for border in found.values()]
-    return found, jax.tree.map(lambda *parts: _listed(parts), *apart)
+    return found, jax.tree.map(lambda *parts: _listed(parts), *found.values())
+
+
+def points_of(problem: ArmProblem, unknowns: tuple, at: ArmState) -> dict[int, PointForces]:
+    """Forces at places of the arm by the places of their couplings."""
+    each = [
+        coupling.points(x, at, note, problem)
+        for coupling, x, note in zip(problem.couplings, unknowns, at.notes, strict=True)
+    ]
+    return {i: points for i, points in enumerate(each) if points is not None}
 
 
 def _listed(parts: tuple[Array, ...]) -> Array:

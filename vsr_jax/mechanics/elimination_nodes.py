@@ -30,7 +30,9 @@ class Node(NamedTuple):
     """What the elimination needs of a node: the blocks of the tangent H (3, 3), the right side
     (6), the axis u, the reaction (6), the rotation (3, 3) and its weight; the derivatives (6,
     motion) of the load density, and of the load at the end of its cell in the world frame, None
-    where there are none; whether the section is `flexible`, 1 or 0, None without rigid pieces."""
+    where there are none; the right side (6) of the wrenches at the end of its cell, in the world
+    frame, None without one; whether the section is `flexible`, 1 or 0, None without rigid
+    pieces."""
 
     bending: Array
     mixed: Array
@@ -42,6 +44,7 @@ class Node(NamedTuple):
     weight: Array
     density: Array | None
     jump: Array | None
+    push: Array | None
     flexible: Array | None
 
 
@@ -62,8 +65,9 @@ def nodes_of(
     slopes: Slopes,
     grid: Grid,
     flexible: Array | None,
+    push: Array | None,
 ) -> Node:
-    """The nodes one after another along the arm, in the first axis."""
+    """The nodes one after another along the arm, in the first axis; see `eliminate_poses`."""
     everything = (*right, *xi, grid.weight, *along.wrench)
     arms = jnp.broadcast_shapes(*(x.shape[2:] for x in everything))
 
@@ -81,6 +85,8 @@ def nodes_of(
     density, jump, rotation = slopes.density, jumps(slopes, grid), along.rotation
     if jump is not None:
         jump = at_last_nodes(jump, grid.X.shape[0])
+    if slopes.cells is not None:
+        jump = slopes.cells if jump is None else jump + slopes.cells
 
     def slope(x: Array | None) -> Array | None:
         """Of a matrix (6, motion, stages, steps, *arms)."""
@@ -97,6 +103,7 @@ def nodes_of(
         listed(grid.weight),
         slope(density),
         slope(jump),
+        None if push is None else moved(push, 6),
         None if flexible is None else listed(flexible),
     )
 

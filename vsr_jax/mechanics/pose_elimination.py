@@ -24,7 +24,19 @@ from jaxtyping import Array
 from ..numerics import component as c
 from ..numerics.component import Matrix, Vector
 from ..numerics.quadrature import Grid
-from ..numerics.stacked import affine, columns, matmul, matvec, once, rows, skew, transpose, turned
+from ..numerics.stacked import (
+    affine,
+    columns,
+    cross,
+    matmul,
+    matvec,
+    once,
+    rows,
+    skew,
+    stack,
+    transpose,
+    turned,
+)
 from .elimination_nodes import (
     Definiteness,
     Node,
@@ -48,7 +60,8 @@ class PoseCell(NamedTuple):
     - `stiff`: the 6 x 6 system without P; `drive`, `right`: its right side per motion, and b.
     - Over the cell the wrench changes by `by_motion` z + `by_strain` $\delta\xi$, without the part
       through P.
-    - `jump`: derivative of the load at the end of the cell by its motion, None without such loads.
+    - `jump`: derivative of the load at the end of the cell by its motion, None without such loads;
+      `push`: right side of the wrenches there, None without one.
     - `flexible`: 1, or 0 where the section is rigid; None without rigid pieces.
     """
 
@@ -62,6 +75,7 @@ class PoseCell(NamedTuple):
     by_motion: Array
     by_strain: Array
     jump: Array | None
+    push: Array | None
     flexible: Array | None
 
 
@@ -74,9 +88,14 @@ def eliminate_poses(
     grid: Grid,
     free: tuple[int, ...],
     flexible: Array | None = None,
+    push: Array | None = None,
 ) -> tuple[Vector, Definiteness]:
-    """As `eliminate`, for motions of size 6."""
-    nodes = nodes_of(c.symmetric(lower), right, xi, along, slopes, grid, flexible)
+    """As `eliminate`, for motions of size 6.
+
+    **Arguments:** `push`: changes (6, stages, steps, *arms) of the wrenches at the ends of the
+    cells in the world frame that do not depend on the motions, a right side too.
+    """
+    nodes = nodes_of(c.symmetric(lower), right, xi, along, slopes, grid, flexible, push)
     cells = jax.vmap(_cell_of)(nodes, turns(nodes.rotation))
     arms = nodes.weight.shape[1:]
     nothing = jnp.zeros((6, 7, *arms), cells.width.dtype)
@@ -94,6 +113,24 @@ def eliminate_poses(
     _, strain = lax.scan(forward, start, (X, cells.turn, cells.lever, cells.width))
     local = jnp.ones(negative.shape, bool)
     return node_components(strain, grid), definiteness(negative, local, asymmetry, grid)
+
+
+def motions(strain: Vector, xi: Vector, along: Reaction, grid: Grid) -> Array:
+    """Rotations and displacements (6, stages, steps, *arms) in the world frame of the ends of the
+    cells by a change of strain, as the elimination has them."""
+    change = grid.weight * turned(along.rotation, stack(strain))
+    axis = grid.weight * matvec(along.rotation, stack(xi[3:]))
+
+    def summed(x: Array) -> Array:
+        """Sums over the cells from the base."""
+        listed = x.swapaxes(1, 2)
+        flat = listed.reshape(3, -1, *listed.shape[3:])
+        return jnp.cumsum(flat, axis=1).reshape(listed.shape).swapaxes(1, 2)
+
+    bent = rows(change, 0, 3)
+    ends = summed(bent)
+    middle = ends - 0.5 * bent
+    return jnp.concatenate([ends, summed(cross(middle, axis) + rows(change, 3, 6))])
 
 
 def _cell_of(node: Node, turn: Array) -> PoseCell:
@@ -119,6 +156,7 @@ def _cell_of(node: Node, turn: Array) -> PoseCell:
         by_motion,
         0.5 * w * by_motion + by_strain,
         None if node.jump is None else seen_from(node.rotation, node.jump),
+        None if node.push is None else turned(transpose(node.rotation), node.push),
         node.flexible,
     )
 
@@ -132,7 +170,10 @@ def _cell(free: tuple[int, ...], end: Array, cell: PoseCell) -> tuple[Array, tup
     by_motion = seen_from(transpose(cell.turn), columns(end, 0, 6))
     if cell.jump is not None:
         by_motion = by_motion + cell.jump
-    P = jnp.concatenate([by_motion, turned(cell.turn, end[:, 6])[:, None]], axis=1)
+    constant = turned(cell.turn, end[:, 6])
+    if cell.push is not None:
+        constant = constant + cell.push
+    P = jnp.concatenate([by_motion, constant[:, None]], axis=1)
     middle = _from_left(lever, P)  # of the wrench in the middle of the cell
     square = once(_from_right(columns(middle, 0, 6), lever))
     by_start = 2.0 * square - columns(middle, 0, 6) + cell.drive

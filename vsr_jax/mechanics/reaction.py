@@ -49,7 +49,7 @@ from ..numerics.stacked import (
 )
 from .chords import Discs, Pull, discs_of, pull_of
 from .pose_terms import PoseTerm, base_of, finite, pose_terms
-from .touch import Surroundings, Touch, at_ends, contact_forces, touch_of
+from .touch import Surroundings, Touch, at_cells, contact_forces, touch_of
 
 
 class FollowerPoint(NamedTuple):
@@ -168,8 +168,9 @@ class PointSlope(NamedTuple):
 
 class Slopes(NamedTuple):
     """Derivatives of the loads in the world frame with respect to motions of their sections: of the
-    density (6, motion, stages, steps), None if it is constant, of the wrenches at points, and of
-    those of chords and contacts at the ends of the steps (6, motion, steps).
+    density (6, motion, stages, steps), None if it is constant, of the wrenches at points, of those
+    of chords at the ends of the steps (6, motion, steps), and of those of contacts at the ends of
+    the cells of the nodes (6, motion, stages, steps).
 
     `joined`: 0 for each step at whose end the arm can be cut, since the wrenches on each side
     depend on the motions of that side relative to the cut; None without cuts."""
@@ -177,12 +178,13 @@ class Slopes(NamedTuple):
     density: Array | None
     points: tuple[PointSlope, ...]
     ends: Array | None
+    cells: Array | None = None
     joined: Array | None = None
 
     @property
     def motion(self) -> int:
         """Size of the motions, see `Loading.motion`."""
-        every = (self.density, self.ends, *(p.matrix for p in self.points))
+        every = (self.density, self.ends, self.cells, *(p.matrix for p in self.points))
         matrices = [x for x in every if x is not None]
         return matrices[0].shape[1] if matrices else 0
 
@@ -347,10 +349,8 @@ def slopes_of(along: Reaction, loads: Loading) -> Slopes:
         else:
             density = here if density is None else density + here
     ends = None if along.pull is None else along.pull.slopes(size)
-    if along.touch is not None:
-        pressed = at_ends(along.touch)
-        ends = pressed if ends is None else ends + pressed
-    return Slopes(density, tuple(points), ends)
+    cells = None if along.touch is None else at_cells(along.touch)
+    return Slopes(density, tuple(points), ends, cells)
 
 
 def _turning(wrench: Array, size: int) -> Array:

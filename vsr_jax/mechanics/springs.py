@@ -12,7 +12,7 @@ from ..numerics.component import Vector
 from ..numerics.quadrature import Grid
 from .elimination_nodes import Definiteness
 
-Solve = Callable[[Vector], tuple[Vector, Definiteness]]
+Solve = Callable[..., tuple[Vector, Definiteness]]
 
 
 def with_springs(solve: Solve, springs: Vector, grid: Grid) -> Solve:
@@ -35,8 +35,8 @@ def with_springs(solve: Solve, springs: Vector, grid: Grid) -> Solve:
     factors = lu.factor(gram + one.reshape(*one.shape, *(1,) * (gram.ndim - 2)))
     held = jnp.sum(lu.diagonal(factors) < 0, axis=0, dtype=jnp.int32)
 
-    def stiffer(b: Vector, /) -> tuple[Vector, Definiteness]:
-        x, (negative, doubtful) = solve(b)
+    def stiffer(b: Vector, *push: Array) -> tuple[Vector, Definiteness]:
+        x, (negative, doubtful) = solve(b, *push)
         force = lu.substitute(factors, work(x))
         less = (jnp.einsum("j...,jsn...->sn...", force, answer) for answer in answers)
         return tuple(a - b for a, b in zip(x, less, strict=True)), Definiteness(

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array
 
@@ -26,6 +27,7 @@ from ..arm.obstacles import Obstacle
 from ..arm.rod import Rod
 from ..numerics.batching import arms_in
 from ..numerics.quadrature import Grid, gauss_legendre, interpolation
+from ..numerics.stacked import columns, matmul, rows, skew
 from .pose_terms import base_of
 
 _SAMPLES, _ITERATIONS = 5, 6
@@ -57,7 +59,9 @@ class Touch(NamedTuple):
 
     **Fields:** `gap` [m]; `normal` (3) and `place` (3) of the contact in the world; `sigma`, its
     place in the step; `shares` (stages) of a force there for the nodes of the step; `force` [N];
-    `slope` (6, 6): derivative of the wrench by the motion of the section, at a given force.
+    `slope` (6, 6): derivative of the wrench by the motion of the section, at a given force; `cell`
+    (stages): 1 for the node at the end of whose cell, of its weight, the contact is nearest; and
+    `lever` (3) from there.
     """
 
     gap: Array
@@ -67,6 +71,8 @@ class Touch(NamedTuple):
     shares: Array
     force: Array
     slope: Array
+    cell: Array
+    lever: Array
 
 
 class _Nearest(NamedTuple):
@@ -107,7 +113,10 @@ def touch_of(axis: Array, grid: Grid, around: Surroundings) -> Touch:
         slope = (force * slope).at[3:, 3:].add(push)
     cumulative, weights = _weights(near.sigma, grid.X.shape[0])
     shares = cumulative / weights.reshape(-1, *(1,) * near.sigma.ndim)
-    return Touch(gap, near.normal, near.place, near.sigma, shares, force, slope)
+    cell = _cell_of(near.sigma, grid.X.shape[0])
+    ends = starts[:, None] + jnp.cumsum(grid.weight * axis, axis=1)
+    lever = near.place - jnp.sum(cell * ends[:, :, None], axis=1)
+    return Touch(gap, near.normal, near.place, near.sigma, shares, force, slope, cell, lever)
 
 
 def contact_forces(touch: Touch) -> Array:
@@ -118,12 +127,24 @@ def contact_forces(touch: Touch) -> Array:
     return later[:, None] + jnp.sum(touch.shares[None] * forces[:, None], axis=2)
 
 
-def at_ends(touch: Touch) -> Array:
-    """Slopes of all contacts at the ends of the steps, (6, 6, steps, *arms), each shared by both
-    ends of its step."""
-    s = touch.sigma
-    later, before = (jnp.sum(share * touch.slope, axis=2) for share in (s, 1 - s))
-    return later + jnp.concatenate([before[:, :, 1:], jnp.zeros_like(before[:, :, :1])], axis=2)
+def at_cells(touch: Touch) -> Array:
+    """Derivatives (6, 6, stages, steps, *arms) of all contact wrenches by the motions of the ends
+    of the cells of the nodes."""
+    d, f = skew(touch.lever), skew(touch.force * touch.normal)
+    turned, moved = columns(touch.slope, 0, 3), columns(touch.slope, 3, 6)
+    slope = jnp.concatenate([turned - matmul(moved, d), moved], axis=1)
+    moment = rows(slope, 0, 3) + matmul(d, rows(slope, 3, 6))
+    turning = jnp.concatenate([matmul(f, d), jnp.zeros_like(d)], axis=1)
+    slope = jnp.concatenate([moment + turning, rows(slope, 3, 6)])
+    return jnp.sum(touch.cell * slope[:, :, None], axis=3)
+
+
+def _cell_of(sigma: Array, stages: int) -> Array:
+    """1 for the node at the end of whose cell a place in the step is nearest, else 0."""
+    ends = np.cumsum(gauss_legendre(stages)[1])
+    between = np.concatenate([[-np.inf], (ends[1:] + ends[:-1]) / 2, [np.inf]])
+    limits = jnp.asarray(between, sigma.dtype).reshape(-1, *(1,) * sigma.ndim)
+    return ((sigma >= limits[:-1]) & (sigma < limits[1:])).astype(sigma.dtype)
 
 
 def _weights(sigma: Array, stages: int) -> tuple[Array, Array]:

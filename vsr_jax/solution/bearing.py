@@ -11,10 +11,10 @@ from jaxtyping import Array, Float
 from ..arm.scene import CrossSections
 from ..mechanics.arm_balance import ArmUnknown, imbalance_of, state_of
 from ..mechanics.balance import free_components, spread
+from ..mechanics.contact import Contacts
 from ..mechanics.coupling import ArmProblem
 from ..mechanics.held import Holds
 from ..numerics import lu
-from ..numerics.component import Vector
 from ..numerics.lanczos import Operator
 from ..numerics.quadrature import Grid
 from ..typing import DTypeLike
@@ -64,12 +64,14 @@ def contacts_of(problem: ArmProblem, unknown: ArmUnknown) -> Contact:
 
 class Supported(eqx.Module):
     """An arm with what holds it and what it touches; `units` scales changes of the free strains,
-    and `ties` are the scaled changes that held sections, contacts and taut cables prevent."""
+    and `ties` are the scaled changes that held sections, contacts and taut cables prevent: rows C,
+    and `share`, $(C C^T)^{-1} C$."""
 
     problem: ArmProblem
     unknown: ArmUnknown
     units: Float[Array, "strains stages steps"]
-    ties: Float[Array, "ties strains stages steps"]
+    ties: Float[Array, "ties changes"]
+    share: Float[Array, "ties changes"]
     free: tuple[int, ...] = eqx.field(static=True)
 
     def tangent(self) -> "SupportedTangent":
@@ -97,12 +99,7 @@ class Supported(eqx.Module):
     def allowed(self, v: Array) -> Array:
         """Orthogonal projection onto the changes that nothing prevents."""
         v = jnp.where(self.units > 0, v, 0.0)
-        rows = self.ties.reshape(len(self.ties), -1)
-        gram = rows @ rows.T + jnp.diag(jnp.where(jnp.any(rows != 0, axis=1), 0.0, 1.0))
-        eps = jnp.finfo(rows.dtype).eps
-        gram = gram + 16 * eps * jnp.diag(jnp.diagonal(gram))
-        prevented = rows.T @ lu.solve(gram, rows @ v.reshape(-1))
-        return v - prevented.reshape(v.shape)
+        return v - (self.ties.T @ (self.share @ v.reshape(-1))).reshape(v.shape)
 
 
 class SupportedTangent(Operator):
@@ -143,21 +140,31 @@ def supported(problem: ArmProblem, unknown: ArmUnknown, free: tuple[int, ...]) -
     at = state_of(unknown.xi, unknown.coupled, problem)
     ties = []
     for coupling, x, note in zip(problem.couplings, unknown.coupled, at.notes, strict=True):
-        border = coupling.border(x, at, note, problem)
-        if border is None:
-            continue
-        rows = _scaled(border.rows, grid.weight * units, free)
-        holds = (border.factors != 0) & (border.corner < _HOLDING)
-        size = jnp.sqrt(jnp.sum(rows**2, axis=(1, 2, 3), keepdims=True))
-        fixed = holds[:, None, None, None] & (size > 0)
-        ties.append(jnp.where(fixed, rows / jnp.where(fixed, size, 1.0), 0.0))
-    return Supported(problem, unknown, units, jnp.concatenate(ties), free)
+        if isinstance(coupling, Contacts):
+            points = coupling.points(x, at, note, problem)
+            rows, corner = coupling.rows(at, note, grid), points.corner.reshape(-1)
+        else:
+            border = coupling.border(x, at, note, problem)
+            if border is None:
+                continue
+            rows, corner = border.rows, border.corner
+        rows = jnp.stack(free_components(rows, free), axis=1) * grid.weight * units
+        rows = rows.reshape(len(rows), -1)
+        size = jnp.linalg.norm(jax.lax.stop_gradient(rows), axis=1)
+        holds = (corner < _HOLDING) & (size > 0)
+        ties.append(jnp.where(holds, 1 / jnp.where(holds, size, 1.0), 0.0)[:, None] * rows)
+    tied = jnp.concatenate(ties)
+    return Supported(problem, unknown, units, tied, _shares(tied), free)
 
 
 _HOLDING = 0.5
-"""Entry in the corner of a border below which its row holds the arm: 1 where it does not."""
+"""Entry in the corner of a tangent system below which its row holds the arm: 1 where it does
+not."""
 
 
-def _scaled(rows: Vector, units: Array, free: tuple[int, ...]) -> Array:
-    """Rows of a border by scaled changes, (ties, strains, stages, steps)."""
-    return jnp.stack(free_components(rows, free), axis=1) * units
+def _shares(ties: Array) -> Array:
+    """The matrix $(C C^T)^{-1} C$ of rows C, some of them zero, some nearly the same."""
+    gram, eps = ties @ ties.T, jnp.finfo(ties.dtype).eps
+    gram = gram + jnp.diag(jnp.where(jnp.any(ties != 0, axis=1), 16 * eps, 1.0))
+    factors = lu.factor(gram)
+    return jax.vmap(lambda b: lu.substitute(factors, b), 1, 1)(ties)
