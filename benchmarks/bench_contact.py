@@ -27,7 +27,7 @@ MODEL, BATCH = vsr.StrainDependent(24), 128
 PILLAR = vsr.Cylinder(0.02, pose=vsr.pose((0.1, 0.0, -0.03), pointing=(0.0, 1.0, 0.0)))
 
 
-def obstacles() -> dict[str, list[vsr.Sphere | vsr.Cylinder]]:
+def obstacles() -> dict[str, list[Any]]:
     """Obstacles by the name of the case; those that are far are never touched."""
     far = [vsr.Sphere((0.05 * i, 0.3, 0.0), 0.02) for i in range(10)]
     return {
@@ -38,7 +38,7 @@ def obstacles() -> dict[str, list[vsr.Sphere | vsr.Cylinder]]:
     }
 
 
-def tip(around: list[vsr.Sphere | vsr.Cylinder], force: jax.Array) -> tuple[jax.Array, jax.Array]:
+def tip(around: list[Any], force: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Height of the tip and Newton steps for a force down [N]."""
     rod = vsr.Rod(0.2, vsr.Circular(0.005), vsr.Material(1e6, poisson=0.3, density=1000.0))
     load = vsr.TipWrench(force=jnp.stack([0.0 * force, 0.005 + 0.0 * force, -force]))

@@ -3,18 +3,21 @@ r"""Contact without friction between an arm and obstacles.
 The unknowns are the contact forces $\lambda$ [N], one per obstacle and step of the grid, where the
 gap g to the obstacle is least (see `touch`). The rows are the complementarity of force and gap,
 
-$$\min(\lambda, k g) = 0,$$
+$$\min(\lambda, k g + c \lambda) = 0,$$
 
-so that forces only push, gaps are not negative and one of the two is zero; the stiffness k only
-scales gaps to forces. The minimum is smoothed,
+so that forces only push, gaps are not negative and one of the two is zero; the stiffness k scales
+gaps to forces, and the compliance c, in the end 1e-10, makes the forces of two contacts at one
+place unique. The minimum is smoothed over a length b, in the end 1e-9 of the arm:
 
-$$\tfrac12 (\lambda + k g - \sqrt{(\lambda - k g)^2 + 4 (k b)^2}) = 0, \quad \lambda g = k b^2,$$
+$$\lambda (k g + c \lambda) = (k b)^2, \quad \lambda > 0.$$
 
-in the end over a length b of 1e-9 of the arm. Newton's method solves for forces and shape together.
+Newton's method solves for forces and shape together, with nearly rigid springs in place of the
+contacts in the elimination along the arm (`PointForces`).
 
-On the way to a solution that this does not find at once, penalties stand for the forces, $\lambda =
-\tfrac12 k_p (\sqrt{g^2 + w^2} - g)$: the balance is then the gradient of an energy, which shows
-whether a step is an advance. The width w becomes smaller; then b does, from 1e-2 of the arm.
+On the way to a solution that this does not find at once, b is 0.1 of the arm and c is 0.01 while
+the loads grow. The force is then given by the gap, $\lambda = \tfrac{k}{2 c} (\sqrt{g^2 + 4 c b^2}
+- g)$, so that the balance is the gradient of an energy, which shows whether a step is an advance.
+After that both become smaller together.
 """
 
 from dataclasses import replace
@@ -37,28 +40,24 @@ from .reaction import Loading
 from .sizes import softest
 from .touch import Surroundings, Touch
 
-_PENALTY, _WIDTH, _SHARPER = 100.0, 0.02, 1e-3
-"""Stiffness $k_p$ of penalties, in multiples of k; their width w, as a fraction of the arm's
-length, and by what it becomes smaller as they harden."""
-
-_BLUR = 1e-9
-"""Length b, as a fraction of the arm's."""
+_FIRST, _LAST = (0.1, 1e-2), (1e-9, 1e-10)
+"""Length b, as a fraction of the arm's, and compliance c, while the loads grow and in the end."""
 
 _RIGID = 2 / 3
-"""Power of the machine epsilon that is the compliance of a contact in the approximate tangent, in
-units of 1 / k: two contacts side by side then share their force."""
+"""Power of the machine epsilon that is the least compliance of a contact in the approximate
+tangent, in units of 1 / k."""
 
-_FLATNESS, _FLATTER = 0.5, 0.5
+_FLATNESS, _FLATTER = 0.5, 0.1
 """Bound on the excess of the gap at the nearest point of a step over the least one, as a fraction
-of the outline over the square of the number of steps, and of the width of penalties."""
+of the outline over the square of the number of steps, and of the length b."""
 
 
 class Contacts(Coupling):
     """All contacts of an arm; the unknowns are their forces [N], shape (obstacles * steps, ...).
 
     **Fields:** the `obstacles`, the `rod` and the position of its `base`; the stiffness k, `scale`;
-    `flatness` and `lift` of `Surroundings`; the lengths b, `blur`, and w, `width`; `soft`: 1 where
-    penalties stand for the forces; the number of `steps`.
+    `flatness` and `lift` of `Surroundings`; the length b, `blur`, and the compliance c, `give`; the
+    number of `steps`; `soft`: 1 where the gaps give the forces.
     """
 
     obstacles: tuple[Obstacle, ...]
@@ -68,9 +67,9 @@ class Contacts(Coupling):
     flatness: Array
     lift: Array
     blur: Array
+    give: Array
     steps: int = eqx.field(static=True)
     soft: Array | None = None
-    width: Array | None = None
     softens = True
 
     def relaxed(self) -> "Contacts":
@@ -78,11 +77,17 @@ class Contacts(Coupling):
         return replace(self, obstacles=obstacles, rod=rod, lift=self.lift + 1e3 * rod.length)
 
     def softened(self, hardness: Array) -> "Contacts":
-        soft = (hardness < SOFTENED).astype(self.scale.dtype)
-        width = (_WIDTH * _SHARPER**hardness * self.rod.length).astype(self.scale.dtype)
-        flatness = jnp.where(soft > 0, jnp.maximum(self.flatness, _FLATTER * width), self.flatness)
-        blur = (_BLUR ** jnp.clip(hardness, 0.25, 1.0) * self.rod.length).astype(self.scale.dtype)
-        return replace(self, soft=soft, width=width, flatness=flatness, blur=blur)
+        of, length = self.scale.dtype, self.rod.length
+        blur, give = (
+            first * (last / first) ** hardness for first, last in zip(_FIRST, _LAST, strict=True)
+        )
+        return replace(
+            self,
+            soft=(hardness < SOFTENED).astype(of),
+            blur=(blur * length).astype(of),
+            give=give.astype(of),
+            flatness=jnp.maximum(self.flatness, _FLATTER * blur * length).astype(of),
+        )
 
     def like(self, other: Coupling) -> bool:
         return isinstance(other, Contacts) and len(self.obstacles) == len(other.obstacles)
@@ -99,10 +104,10 @@ class Contacts(Coupling):
             self.base,
             self.flatness,
             self.lift,
-            _PENALTY * self.scale,
+            self.scale / self.give,
+            2 * jnp.sqrt(self.give) * self.blur,
             x,
             self.soft,
-            self.width,
         )
         return loads._replace(around=around)
 
@@ -115,20 +120,27 @@ class Contacts(Coupling):
     def residual(
         self, x: Array, at: ArmState, note: Touch, problem: ArmProblem, free: tuple[int, ...]
     ) -> Array:
-        pushed = self.scale * note.gap
-        exact = 0.5 * (note.force + pushed - self._root(note.force - pushed))
+        force, own = note.force, x.reshape(note.force.shape)
+        pushed = self.scale * note.gap + self.give * force
+        rows = 0.5 * (force + pushed - self._root(force - pushed))
+        rows = jnp.where(jnp.sum(note.handed, axis=2) > 0, own, rows)
         if self.soft is not None:
-            exact = jnp.where(self.soft > 0, x.reshape(exact.shape) - note.force, exact)
-        return exact.reshape(x.shape)
+            rows = jnp.where(self.soft > 0, own - force, rows)
+        return rows.reshape(x.shape)
 
     def points(self, x: Array, at: ArmState, note: Touch, problem: ArmProblem) -> PointForces:
-        apart = note.force - self.scale * note.gap
-        pushing = 0.5 * (1 + apart / self._root(apart))
-        hard = jnp.ones_like(apart) if self.soft is None else 1 - self.soft + 0 * apart
+        apart = (1 - self.give) * note.force - self.scale * note.gap
+        free = 1 - jnp.sum(note.handed, axis=2)
+        free = free if self.soft is None else (1 - self.soft) * free
+        pushing = 0.5 * free * (1 + apart / self._root(apart))
         least = jnp.finfo(x.dtype).eps ** _RIGID
-        unit = hard * jnp.concatenate([cross(note.lever, note.normal), note.normal])
-        corner = jnp.maximum(1 - hard * pushing, least)
-        return PointForces(unit, note.cell, hard * pushing * self.scale, corner)
+        return PointForces(
+            free * jnp.concatenate([cross(note.lever, note.normal), note.normal]),
+            note.cell,
+            pushing * self.scale,
+            jnp.maximum(1 - (1 - self.give) * pushing, least),
+            note.handed,
+        )
 
     def rows(self, at: ArmState, note: Touch, grid: Grid) -> Vector:
         """For each contact of one arm the wrenches at the nodes whose work over a change of strain
@@ -185,6 +197,7 @@ def contacts_of(scene: Scene, sections: CrossSections, grid: Grid) -> Contacts |
         3 * bending / length**3,
         flatness,
         jnp.zeros_like(length),
-        _BLUR * length,
+        _LAST[0] * length,
+        jnp.full_like(length, _LAST[1]),
         grid.h.shape[0],
     )

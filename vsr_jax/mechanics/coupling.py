@@ -31,6 +31,7 @@ from ..numerics.damped_newton import HARDENING_STAGES, LOAD_INCREMENTS, SOFT_STA
 from ..numerics.quadrature import Grid
 from .balance import without_force
 from .reaction import Loading, Reaction
+from .touch import from_cells, to_cells
 
 HARDENING = HARDENING_STAGES / LOAD_INCREMENTS
 """By what the fraction of the loads exceeds 1 where constraints are exact."""
@@ -138,31 +139,38 @@ class PointForces(NamedTuple):
     wrench a of a unit force. Springs of the stiffness $f a a^T / c$ stand for them in the
     elimination, in place of a border.
 
-    - `wrench`: a, in the world frame at the end of a cell of a node, shape (6, n, steps, ...).
-    - `cell`: 1 for that node of the step, else 0, shape (stages, n, steps, ...).
+    - `wrench`: a, in the world frame at an end of the cell of a node, shape (6, n, steps, ...).
+    - `cell`: 1 for that end, else 0, shape (stages + 1, n, steps, ...); the first end of each step
+      is its start.
     - `factors`, `corner`: f and c, shape (n, steps, ...).
+    - `handed`: 1 where the unknown of a step (second axis) is part of the force of another (third
+      axis), shape (n, steps, steps, ...); f is zero and c is 1 for it.
     """
 
     wrench: Array
     cell: Array
     factors: Array
     corner: Array
+    handed: Array
 
     def slopes(self) -> Array:
         """Derivatives (6, 6, stages, steps, ...) of the wrenches by the motions."""
         stiffness = -self.cell * self.factors / self.corner
-        return jnp.sum(stiffness * (self.wrench[:, None] * self.wrench)[:, :, None], axis=3)
+        square = self.wrench[:, None] * self.wrench
+        return to_cells(jnp.sum(stiffness * square[:, :, None], axis=3), 2)
 
     def pushes(self, rows: Array) -> Array:
         """Changes (6, stages, steps, ...) of the wrenches by given rows (n * steps, ...) alone."""
         force = rows.reshape(self.corner.shape) / self.corner
-        return jnp.sum(self.cell * (force * self.wrench)[:, None], axis=2)
+        return to_cells(jnp.sum(self.cell * (force * self.wrench)[:, None], axis=2), 1)
 
     def change(self, rows: Array, motions: Array) -> Array:
         """Changes of the unknowns for given rows and motions (6, stages, steps, ...)."""
-        there = jnp.sum(self.cell * motions[:, :, None], axis=1)
+        there = jnp.sum(self.cell * from_cells(motions, 1)[:, :, None], axis=1)
         moved = self.factors * jnp.sum(self.wrench * there, axis=0)
-        return ((rows.reshape(moved.shape) - moved) / self.corner).reshape(rows.shape)
+        change = (rows.reshape(moved.shape) - moved) / self.corner
+        change = change - jnp.sum(self.handed * change[:, :, None], axis=1)
+        return change.reshape(rows.shape)
 
 
 class Coupling(eqx.Module):

@@ -30,17 +30,17 @@ from ..numerics.quadrature import Grid, gauss_legendre, interpolation
 from ..numerics.stacked import columns, matmul, rows, skew
 from .pose_terms import base_of
 
-_SAMPLES, _ITERATIONS = 5, 6
-"""Points of a step from which the nearest one starts, and Newton steps from it."""
+_SAMPLES, _ITERATIONS = 5, 8
+"""Points of a step from which the nearest one starts, and bound on the Newton steps from it."""
 
 
 class Surroundings(NamedTuple):
     r"""The obstacles around an arm.
 
     **Fields:** the `obstacles`, the `rod` and the position of its `base`; `flatness` $\epsilon$
-    [m]; `lift` [m], added to all gaps; `force` [N] of each obstacle on each step, shape (obstacles
-    * steps, ...); `soft`: None, or 1 where penalties of a `stiffness` [N/m] and `width` [m] stand
-    for the forces.
+    [m]; `lift` [m], added to all gaps; `stiffness` [N/m] and `width` [m] of penalties; `force` [N]
+    of each obstacle on each step, shape (obstacles * steps, ...); `soft`: None, or 1 where
+    penalties stand for the forces.
     """
 
     obstacles: tuple[Obstacle, ...]
@@ -49,9 +49,9 @@ class Surroundings(NamedTuple):
     flatness: Array
     lift: Array
     stiffness: Array
+    width: Array
     force: Array
     soft: Array | None
-    width: Array | None
 
 
 class Touch(NamedTuple):
@@ -60,8 +60,9 @@ class Touch(NamedTuple):
     **Fields:** `gap` [m]; `normal` (3) and `place` (3) of the contact in the world; `sigma`, its
     place in the step; `shares` (stages) of a force there for the nodes of the step; `force` [N];
     `slope` (6, 6): derivative of the wrench by the motion of the section, at a given force; `cell`
-    (stages): 1 for the node at the end of whose cell, of its weight, the contact is nearest; and
-    `lever` (3) from there.
+    (stages + 1): 1 for that end of the cells of the nodes which is nearest, the first of them the
+    start of the step; and `lever` (3) from there; `handed` (obstacles, steps, steps, *arms): 1
+    where the force of a step is handed on to another, since the nearest point is not in it.
     """
 
     gap: Array
@@ -73,11 +74,13 @@ class Touch(NamedTuple):
     slope: Array
     cell: Array
     lever: Array
+    handed: Array
 
 
 class _Nearest(NamedTuple):
     """The nearest point of one step: place in the step, gap there without and with the term in
-    epsilon, normal, position, and the matrix of `Touch.slope` per force."""
+    epsilon, normal, position, and the matrix of `Touch.slope` per force; 1 or -1 where points
+    beyond the end or the start of the step are nearer, else 0."""
 
     sigma: Array
     gap: Array
@@ -85,6 +88,7 @@ class _Nearest(NamedTuple):
     normal: Array
     place: Array
     slope: Array
+    nearer: Array
 
 
 def touch_of(axis: Array, grid: Grid, around: Surroundings) -> Touch:
@@ -92,16 +96,20 @@ def touch_of(axis: Array, grid: Grid, around: Surroundings) -> Touch:
     parts = jnp.sum(grid.weight * axis, axis=1)
     base = base_of(around.base, parts.ndim - 2)[:, None]
     starts = base + jnp.cumsum(parts, axis=1) - parts
-    found = [
-        _each(_nearest, obstacle, around.rod, around.flatness, starts, axis, grid.start, grid.h)
-        for obstacle in around.obstacles
-    ]
-    near = jax.tree.map(lambda *x: jnp.stack(x, axis=x[0].ndim - starts.ndim + 1), *found)
+    near = _of_all(
+        around.obstacles, (around.rod, around.flatness, starts, axis, grid.start, grid.h)
+    )
     # empty steps, all at one place, touch nothing
     lift = around.lift + jnp.where(grid.h > 0, 0.0, 1e3 * around.rod.length)
     gap = near.gap + lift
+    handed = _handed(near.nearer, grid.h > 0)
     force, slope = around.force.reshape(gap.shape), near.slope
-    if around.soft is None or around.width is None:
+    if around.soft is not None:
+        handed = jnp.where(around.soft > 0, 0.0, handed)
+    leaves = jnp.sum(handed, axis=2)
+    arrives = jnp.sum(handed * force[:, :, None], axis=1)
+    force = (1 - leaves) * force + arrives
+    if around.soft is None:
         slope = force * slope
     else:
         raised = near.raised + lift
@@ -114,9 +122,12 @@ def touch_of(axis: Array, grid: Grid, around: Surroundings) -> Touch:
     cumulative, weights = _weights(near.sigma, grid.X.shape[0])
     shares = cumulative / weights.reshape(-1, *(1,) * near.sigma.ndim)
     cell = _cell_of(near.sigma, grid.X.shape[0])
-    ends = starts[:, None] + jnp.cumsum(grid.weight * axis, axis=1)
+    along = jnp.pad(grid.weight * axis, [(0, 0), (1, 0), *[(0, 0)] * (axis.ndim - 2)])
+    ends = starts[:, None] + jnp.cumsum(along, axis=1)
     lever = near.place - jnp.sum(cell * ends[:, :, None], axis=1)
-    return Touch(gap, near.normal, near.place, near.sigma, shares, force, slope, cell, lever)
+    return Touch(
+        gap, near.normal, near.place, near.sigma, shares, force, slope, cell, lever, handed
+    )
 
 
 def contact_forces(touch: Touch) -> Array:
@@ -136,15 +147,49 @@ def at_cells(touch: Touch) -> Array:
     moment = rows(slope, 0, 3) + matmul(d, rows(slope, 3, 6))
     turning = jnp.concatenate([matmul(f, d), jnp.zeros_like(d)], axis=1)
     slope = jnp.concatenate([moment + turning, rows(slope, 3, 6)])
-    return jnp.sum(touch.cell * slope[:, :, None], axis=3)
+    return to_cells(jnp.sum(touch.cell * slope[:, :, None], axis=3), 2)
+
+
+def to_cells(x: Array, axis: int) -> Array:
+    """What acts at the ends of the cells (..., stages + 1, steps, *arms), the first of them the
+    start of the step, as (..., stages, steps, *arms). Nothing moves the start of the arm."""
+    ahead = lax.slice_in_dim(x, 0, 1, axis=axis)
+    ahead = lax.slice_in_dim(ahead, 1, None, axis=axis + 1)
+    stages = x.shape[axis] - 1
+    room = [(0, 0)] * x.ndim
+    room[axis], room[axis + 1] = (stages - 1, 0), (0, 1)
+    return lax.slice_in_dim(x, 1, None, axis=axis) + jnp.pad(ahead, room)
+
+
+def from_cells(x: Array, axis: int) -> Array:
+    """The transposed map: what moves (..., stages, steps, *arms) at all ends of the cells."""
+    before = lax.slice_in_dim(x, x.shape[axis] - 1, None, axis=axis)
+    before = lax.slice_in_dim(before, 0, x.shape[axis + 1] - 1, axis=axis + 1)
+    room = [(0, 0)] * x.ndim
+    room[axis + 1] = (1, 0)
+    return jnp.concatenate([jnp.pad(before, room), x], axis=axis)
 
 
 def _cell_of(sigma: Array, stages: int) -> Array:
-    """1 for the node at the end of whose cell a place in the step is nearest, else 0."""
-    ends = np.cumsum(gauss_legendre(stages)[1])
+    """1 for the end of a cell that is nearest to a place in the step, else 0."""
+    ends = np.cumsum([0.0, *gauss_legendre(stages)[1]])
     between = np.concatenate([[-np.inf], (ends[1:] + ends[:-1]) / 2, [np.inf]])
     limits = jnp.asarray(between, sigma.dtype).reshape(-1, *(1,) * sigma.ndim)
     return ((sigma >= limits[:-1]) & (sigma < limits[1:])).astype(sigma.dtype)
+
+
+def _handed(nearer: Array, there: Array) -> Array:
+    """For each obstacle 1 where the force of a step (second axis) belongs to another (third axis):
+    the next one, in the direction in which points are nearer, with a nearest point of its own."""
+    steps = nearer.shape[1]
+    index = jnp.arange(steps).reshape(1, -1, *(1,) * (nearer.ndim - 2))
+    own = there[None] & jnp.ones(nearer.shape, bool)
+    ahead = lax.cummin(jnp.where(own & (nearer <= 0), index, steps), axis=1, reverse=True)
+    behind = lax.cummax(jnp.where(own & (nearer >= 0), index, -1), axis=1)
+    target = jnp.where(nearer > 0, ahead, jnp.where(nearer < 0, behind, index))
+    other = (target != index) & (target >= 0) & (target < steps)
+    to = jnp.arange(steps).reshape(1, 1, -1, *(1,) * (nearer.ndim - 2))
+    return (other[:, :, None] & (target[:, :, None] == to)).astype(nearer.dtype)
 
 
 def _weights(sigma: Array, stages: int) -> tuple[Array, Array]:
@@ -160,41 +205,97 @@ def _nearest(
     obstacle: Obstacle, rod: Rod, flatness: Array, start: Array, axis: Array, X: Array, h: Array
 ) -> _Nearest:
     """The nearest point of one step of one arm."""
-
-    def place(s: Array) -> Array:
-        return start + h * (axis @ _weights(s, axis.shape[1])[0])
-
-    def gap(s: Array) -> Array:
-        return obstacle.distance(place(s)) - rod.outline(X + s * h)
-
-    # less where the gap has a clear minimum
-    curved = 4 * (gap(jnp.zeros_like(h)) + gap(jnp.ones_like(h)) - 2 * gap(0.5 * jnp.ones_like(h)))
-    flat = flatness * 8 * flatness / (8 * flatness + jnp.maximum(curved, 0.0))
-
-    def lifted(s: Array) -> Array:
-        return gap(s) + flat * (2 * s - 1) ** 2
-
-    slope_at, curvature_at = jax.grad(lifted), jax.grad(jax.grad(lifted))
-    samples = jnp.linspace(0.0, 1.0, _SAMPLES, dtype=h.dtype)
-    first = samples[jnp.argmin(jax.vmap(lifted)(samples))]
-
-    def closer(_: Array, s: Array) -> Array:
-        slope, curvature = slope_at(s), curvature_at(s)
-        step = jnp.where(curvature > 0, slope / curvature, jnp.sign(slope))
-        return jnp.clip(s - jnp.clip(step, -0.25, 0.25), 0.0, 1.0)
-
-    s = lax.stop_gradient(lax.fori_loop(0, _ITERATIONS, closer, first))
-    curvature = lax.stop_gradient(curvature_at(s))
+    step = _Step(obstacle, rod, flatness, start, axis, X, h)
+    fixed = lax.stop_gradient(step)
+    s = _search(fixed)
+    rate, curvature = fixed.slope(s), fixed.curvature(s)
     inside = (s > 0) & (s < 1) & (curvature > 0)
     curvature = jnp.where(inside, curvature, 1.0)
     # its derivative by the shape is that of the root of the slope
-    s = jnp.clip(s - jnp.where(inside, slope_at(s) / curvature, 0.0), 0.0, 1.0)
-    r, along = jax.jvp(place, (s,), (jnp.ones_like(s),))
+    s = jnp.clip(s - jnp.where(inside, step.slope(s) / curvature, 0.0), 0.0, 1.0)
+    r, along = jax.jvp(step.place, (s,), (jnp.ones_like(s),))
     normal, turn = jax.jvp(jax.grad(obstacle.distance), (r,), (along,))
     bend = jax.jacfwd(jax.grad(obstacle.distance))(r)
     moved = jnp.concatenate([jnp.cross(along, normal), turn])
     slope = -jnp.where(inside, 1 / curvature, 0.0) * moved[:, None] * moved[None]
-    return _Nearest(s, gap(s), lifted(s), normal, r, slope.at[3:, 3:].add(bend))
+    at_end, at_start = (s >= 1) & (rate < 0), (s <= 0) & (rate > 0)
+    nearer = at_end.astype(h.dtype) - at_start.astype(h.dtype)
+    return _Nearest(s, step.gap(s), step.lifted(s), normal, r, slope.at[3:, 3:].add(bend), nearer)
+
+
+class _Step(NamedTuple):
+    """One step of one arm near an obstacle."""
+
+    obstacle: Obstacle
+    rod: Rod
+    flatness: Array
+    start: Array
+    axis: Array
+    X: Array
+    h: Array
+
+    def place(self, s: Array) -> Array:
+        """Position at a place in the step."""
+        return self.start + self.h * (self.axis @ _weights(s, self.axis.shape[1])[0])
+
+    def gap(self, s: Array) -> Array:
+        """Gap there."""
+        return self.obstacle.distance(self.place(s)) - self.rod.outline(self.X + s * self.h)
+
+    def lifted(self, s: Array) -> Array:
+        """Gap with the term in epsilon, less where the gap has a clear minimum."""
+        first, middle, last = jax.vmap(self.gap)(jnp.array([0.0, 0.5, 1.0], self.h.dtype))
+        bulge = 8 * self.flatness
+        flat = self.flatness * bulge / (bulge + jnp.maximum(4 * (first + last - 2 * middle), 0.0))
+        return self.gap(s) + flat * (2 * s - 1) ** 2
+
+    def slope(self, s: Array) -> Array:
+        """Its derivative."""
+        return jax.grad(self.lifted)(s)
+
+    def curvature(self, s: Array) -> Array:
+        """Its second derivative."""
+        return jax.grad(self.slope)(s)
+
+
+def _search(step: _Step) -> Array:
+    """The place in a step where its `lifted` gap is least, by Newton's method from the least of
+    some samples."""
+    samples = jnp.linspace(0.0, 1.0, _SAMPLES, dtype=step.h.dtype)
+    first = samples[jnp.argmin(jax.vmap(step.lifted)(samples))]
+    tolerance = jnp.finfo(step.h.dtype).eps ** 0.5
+
+    def closer(state: tuple) -> tuple:
+        s, _, count = state
+        slope, curvature = step.slope(s), step.curvature(s)
+        change = jnp.where(curvature > 0, slope / curvature, jnp.sign(slope))
+        next = jnp.clip(s - jnp.clip(change, -0.25, 0.25), 0.0, 1.0)
+        return next, jnp.abs(next - s), count + 1
+
+    def going(state: tuple) -> Array:
+        return (state[1] > tolerance) & (state[2] < _ITERATIONS)
+
+    return lax.while_loop(going, closer, (first, jnp.ones_like(first), jnp.array(0)))[0]
+
+
+def _of_all(obstacles: tuple[Obstacle, ...], arm: tuple) -> _Nearest:
+    """The nearest points of all steps to all obstacles, arrays (..., obstacles, steps, *arms).
+
+    Those whose numbers have the same shapes share one program."""
+    alike: dict[Any, list[int]] = {}
+    for i, obstacle in enumerate(obstacles):
+        leaves, form = jax.tree.flatten(obstacle)
+        alike.setdefault((form, tuple(jnp.shape(leaf) for leaf in leaves)), []).append(i)
+    found = [
+        jax.vmap(lambda one: _each(_nearest, one, *arm))(
+            jax.tree.map(lambda *x: jnp.stack(x), *(obstacles[i] for i in places))
+        )
+        for places in alike.values()
+    ]
+    order = np.argsort(np.concatenate(list(alike.values())))
+    near = jax.tree.map(lambda *x: jnp.concatenate(x)[order], *found)
+    ends = jnp.ndim(near.sigma) - 1  # the obstacles come before the axes of steps and arms
+    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, x.ndim - 1 - ends), near)
 
 
 def _each(

@@ -20,7 +20,7 @@ MAX_PLAIN_STEPS = 25
 LOAD_INCREMENTS = 5
 """Increments in which `damped_newton` applies the loads where they cannot be applied at once: the
 tangent is often indefinite at the start under all loads."""
-SOFT_STAGES, HARDENING_STAGES = 2, 8
+SOFT_STAGES, HARDENING_STAGES = 1, 8
 """Number of increments after the loads with springs in place of constraints, which have an energy,
 and of all by which constraints harden in `damped_newton`."""
 MAX_TURN = 1.5
