@@ -42,6 +42,20 @@ class Obstacle(Part):
         """The numbers that must be positive, by name."""
         return {}
 
+    @property
+    def room(self) -> Scalar | None:
+        """Radius [m] of the largest ball that passes everywhere along it, if it encloses the arm,
+        else None."""
+        return None
+
+    def directions(
+        self, point: Position, heading: Position, lengths: Float[Array, " steps"]
+    ) -> Float[Array, "steps 3"] | None:
+        """Unit vectors along the middle of one that encloses the arm, after steps of some lengths
+        [m] from the place nearest to a point, in the direction that is nearer to a heading; None
+        for the heading everywhere."""
+        return None
+
     def check(self, name: str, outline: float) -> None:
         """Raises `ValueError` if an arm has no room, for known numbers. A scene calls this.
 

@@ -99,6 +99,29 @@ class Tube(Obstacle):
     def sizes(self) -> dict[str, Array]:
         return {"radius": jnp.min(self.radii)}
 
+    @property
+    def room(self) -> Scalar:
+        return jnp.min(self.radii)
+
+    def directions(
+        self, point: Position, heading: Position, lengths: Float[Array, " steps"]
+    ) -> Float[Array, "steps 3"] | None:
+        if self.line is None:
+            return None
+        curve = curve_through(self.line, self.radius)
+        turn = jnp.eye(3, dtype=self.line.dtype) if self.pose is None else self.pose[:3, :3]
+        start, _ = _nearest(curve, local_point(self.pose, point))
+        forth = jnp.sign(turn @ curve.at(start)[1] @ heading)
+
+        def rate(s: Scalar) -> Scalar:
+            return forth / jnp.linalg.norm(curve.at(s)[1])
+
+        def walk(s: Scalar, h: Scalar) -> tuple[Scalar, Position]:
+            s = s + h * rate(s + 0.5 * h * rate(s))
+            return s, turn @ curve.at(s)[1] * rate(s)
+
+        return lax.scan(walk, start, lengths)[1]
+
 
 class Curve(NamedTuple):
     """A centre line: the abscissas [m] of its points; the start of each piece [m] and its

@@ -102,6 +102,8 @@ def _start(problem: ArmProblem, free: tuple[int, ...]) -> ArmUnknown:
         jnp.where(near, x, x0).astype(exact.dtype)
         for x, x0, exact in zip(xi, rest, problem.sections.rest, strict=True)
     )
+    for coupling in problem.couplings:
+        xi = coupling.start(xi, problem)
     return ArmUnknown(with_locked(xi, problem.sections, free), coupled)
 
 

@@ -24,6 +24,7 @@ from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from ..arm.obstacles import Obstacle
@@ -31,7 +32,7 @@ from ..arm.rod import Rod
 from ..arm.scene import CrossSections, Scene
 from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import Grid, locate
-from ..numerics.se3 import base_pose
+from ..numerics.se3 import base_pose, stacked_rotation
 from ..numerics.stacked import cross
 from .coupling import SOFTENED, ArmProblem, ArmState, Coupling, PointForces
 from .held import of_forces
@@ -43,11 +44,15 @@ from .touch import Surroundings, Touch
 _FIRST, _LAST = (0.1, 1e-2), (1e-9, 1e-10)
 """Length b, as a fraction of the arm's, and compliance c, while the loads grow and in the end."""
 
+_ROOMY = 0.3
+"""Room between arm and wall, as a fraction of the arm's length, below which both are smaller from
+the start."""
+
 _RIGID = 2 / 3
 """Power of the machine epsilon that is the least compliance of a contact in the approximate
 tangent, in units of 1 / k."""
 
-_FLATNESS, _FLATTER = 0.5, 0.1
+_FLATNESS, _FLATTER = 0.05, 0.1
 """Bound on the excess of the gap at the nearest point of a step over the least one, as a fraction
 of the outline over the square of the number of steps, and of the length b."""
 
@@ -56,8 +61,9 @@ class Contacts(Coupling):
     """All contacts of an arm; the unknowns are their forces [N], shape (obstacles * steps, ...).
 
     **Fields:** the `obstacles`, the `rod` and the position of its `base`; the stiffness k, `scale`;
-    `flatness` and `lift` of `Surroundings`; the length b, `blur`, and the compliance c, `give`; the
-    number of `steps`; `soft`: 1 where the gaps give the forces.
+    `flatness` and `lift` of `Surroundings`; the length b, `blur`, and the compliance c, `give`, and
+    both while the loads grow, `first`; the number of `steps`; `soft`: 1 where the gaps give the
+    forces.
     """
 
     obstacles: tuple[Obstacle, ...]
@@ -68,6 +74,7 @@ class Contacts(Coupling):
     lift: Array
     blur: Array
     give: Array
+    first: Array
     steps: int = eqx.field(static=True)
     soft: Array | None = None
     softens = True
@@ -79,7 +86,8 @@ class Contacts(Coupling):
     def softened(self, hardness: Array) -> "Contacts":
         of, length = self.scale.dtype, self.rod.length
         blur, give = (
-            first * (last / first) ** hardness for first, last in zip(_FIRST, _LAST, strict=True)
+            first * (last / first) ** hardness
+            for first, last in zip(self.first, _LAST, strict=True)
         )
         return replace(
             self,
@@ -88,6 +96,18 @@ class Contacts(Coupling):
             give=give.astype(of),
             flatness=jnp.maximum(self.flatness, _FLATTER * blur * length).astype(of),
         )
+
+    def start(self, xi: Vector, problem: ArmProblem) -> Vector:
+        """The bending of the middle of what encloses the arm, if it is bent."""
+        for obstacle in self.obstacles:
+            bending = _bending_along(obstacle, self.rod.base, problem.grid.h)
+            if bending is not None:
+                return (
+                    xi[0],
+                    *(0.0 * x + k for x, k in zip(xi[1:3], bending, strict=True)),
+                    *xi[3:],
+                )
+        return xi
 
     def like(self, other: Coupling) -> bool:
         return isinstance(other, Contacts) and len(self.obstacles) == len(other.obstacles)
@@ -121,7 +141,7 @@ class Contacts(Coupling):
         self, x: Array, at: ArmState, note: Touch, problem: ArmProblem, free: tuple[int, ...]
     ) -> Array:
         force, own = note.force, x.reshape(note.force.shape)
-        pushed = self.scale * note.gap + self.give * force
+        pushed = self.scale * note.raised + self.give * force
         rows = 0.5 * (force + pushed - self._root(force - pushed))
         rows = jnp.where(jnp.sum(note.handed, axis=2) > 0, own, rows)
         if self.soft is not None:
@@ -129,7 +149,7 @@ class Contacts(Coupling):
         return rows.reshape(x.shape)
 
     def points(self, x: Array, at: ArmState, note: Touch, problem: ArmProblem) -> PointForces:
-        apart = (1 - self.give) * note.force - self.scale * note.gap
+        apart = (1 - self.give) * note.force - self.scale * note.raised
         free = 1 - jnp.sum(note.handed, axis=2)
         free = free if self.soft is None else (1 - self.soft) * free
         pushing = 0.5 * free * (1 + apart / self._root(apart))
@@ -182,6 +202,25 @@ class Contacts(Coupling):
         return jnp.broadcast_to(1 / (self.scale * problem.length), (size,))
 
 
+def _bending_along(obstacle: Obstacle, base: Array | None, h: Array) -> Array | None:
+    """Bending (2, steps) of an arm along the middle of what encloses it, from the turns of its
+    directions, without twist."""
+    pose = jnp.asarray(base_pose(base, h.dtype))
+    ahead = obstacle.directions(pose[:3, 3], pose[:3, 0], h)
+    if ahead is None:
+        return None
+
+    def turn(R: Array, step: tuple) -> tuple[Array, Array]:
+        t, h = step
+        axis, cosine = jnp.cross(R[:, 0], t), R[:, 0] @ t
+        sine = jnp.linalg.norm(axis)
+        vector = axis * jnp.arctan2(sine, cosine) / jnp.where(sine > 0, sine, 1.0)
+        k = R.T @ vector / jnp.where(h > 0, h, jnp.inf)
+        return stacked_rotation(vector) @ R, k[1:]
+
+    return lax.scan(turn, pose[:3, :3], (ahead, h))[1].T
+
+
 def contacts_of(scene: Scene, sections: CrossSections, grid: Grid) -> Contacts | None:
     """The contacts of a scene; None if it has no obstacles."""
     if not scene.obstacles:
@@ -199,5 +238,22 @@ def contacts_of(scene: Scene, sections: CrossSections, grid: Grid) -> Contacts |
         jnp.zeros_like(length),
         _LAST[0] * length,
         jnp.full_like(length, _LAST[1]),
+        _first(scene, length),
         grid.h.shape[0],
     )
+
+
+def _first(scene: Scene, length: Array) -> Array:
+    """Length b, as a fraction of the arm's, and compliance c while the loads grow: smaller where a
+    lumen leaves the arm little room."""
+    blur, give = (jnp.full_like(length, x) for x in _FIRST)
+    for obstacle in scene.obstacles:
+        room = obstacle.room
+        if room is not None:
+            room = (room - scene.rod.outline(0.5 * scene.rod.length)) / length
+            narrow = jnp.clip(room / _ROOMY, 1e-3, 1.0).astype(length.dtype)
+            blur, give = (
+                jnp.minimum(blur, narrow * _FIRST[0]),
+                jnp.minimum(give, narrow * _FIRST[1]),
+            )
+    return jnp.stack([blur, give])

@@ -191,6 +191,10 @@ class Coupling(eqx.Module):
     def guess(self, forces: Forces, grid: Grid) -> PyTree:
         """Unknowns that go with the forces of all threads at their start, to begin with."""
 
+    def start(self, xi: Vector, problem: ArmProblem) -> Vector:
+        """Strain from which Newton's method starts; unchanged by default."""
+        return xi
+
     def softened(self, hardness: Array) -> "Coupling":
         """The coupling with springs in place of its constraint, from `hardness` 0 up to 1, where it
         is exact; the same by default."""

@@ -57,15 +57,17 @@ class Surroundings(NamedTuple):
 class Touch(NamedTuple):
     r"""Contact of each obstacle with each step, arrays (..., obstacles, steps, *arms).
 
-    **Fields:** `gap` [m]; `normal` (3) and `place` (3) of the contact in the world; `sigma`, its
-    place in the step; `shares` (stages) of a force there for the nodes of the step; `force` [N];
-    `slope` (6, 6): derivative of the wrench by the motion of the section, at a given force; `cell`
-    (stages + 1): 1 for that end of the cells of the nodes which is nearest, the first of them the
-    start of the step; and `lever` (3) from there; `handed` (obstacles, steps, steps, *arms): 1
-    where the force of a step is handed on to another, since the nearest point is not in it.
+    **Fields:** `gap` [m], and `raised` by the term in epsilon; `normal` (3) and `place` (3) of the
+    contact in the world; `sigma`, its place in the step; `shares` (stages) of a force there for the
+    nodes of the step; `force` [N]; `slope` (6, 6): derivative of the wrench by the motion of the
+    section, at a given force; `cell` (stages + 1): 1 for that end of the cells of the nodes which
+    is nearest, the first of them the start of the step; and `lever` (3) from there; `handed`
+    (obstacles, steps, steps, *arms): 1 where the force of a step is handed on to another, since the
+    nearest point is not in it.
     """
 
     gap: Array
+    raised: Array
     normal: Array
     place: Array
     sigma: Array
@@ -101,7 +103,7 @@ def touch_of(axis: Array, grid: Grid, around: Surroundings) -> Touch:
     )
     # empty steps, all at one place, touch nothing
     lift = around.lift + jnp.where(grid.h > 0, 0.0, 1e3 * around.rod.length)
-    gap = near.gap + lift
+    gap, raised = near.gap + lift, near.raised + lift
     handed = _handed(near.nearer, grid.h > 0)
     force, slope = around.force.reshape(gap.shape), near.slope
     if around.soft is not None:
@@ -112,7 +114,6 @@ def touch_of(axis: Array, grid: Grid, around: Surroundings) -> Touch:
     if around.soft is None:
         slope = force * slope
     else:
-        raised = near.raised + lift
         root = jnp.sqrt(raised**2 + around.width**2)
         penalty = 0.5 * around.stiffness * (root - raised)
         rate = 0.5 * around.stiffness * (raised / root - 1)
@@ -126,7 +127,17 @@ def touch_of(axis: Array, grid: Grid, around: Surroundings) -> Touch:
     ends = starts[:, None] + jnp.cumsum(along, axis=1)
     lever = near.place - jnp.sum(cell * ends[:, :, None], axis=1)
     return Touch(
-        gap, near.normal, near.place, near.sigma, shares, force, slope, cell, lever, handed
+        gap,
+        raised,
+        near.normal,
+        near.place,
+        near.sigma,
+        shares,
+        force,
+        slope,
+        cell,
+        lever,
+        handed,
     )
 
 
@@ -243,11 +254,8 @@ class _Step(NamedTuple):
         return self.obstacle.distance(self.place(s)) - self.rod.outline(self.X + s * self.h)
 
     def lifted(self, s: Array) -> Array:
-        """Gap with the term in epsilon, less where the gap has a clear minimum."""
-        first, middle, last = jax.vmap(self.gap)(jnp.array([0.0, 0.5, 1.0], self.h.dtype))
-        bulge = 8 * self.flatness
-        flat = self.flatness * bulge / (bulge + jnp.maximum(4 * (first + last - 2 * middle), 0.0))
-        return self.gap(s) + flat * (2 * s - 1) ** 2
+        """Gap with the term in epsilon."""
+        return self.gap(s) + self.flatness * (2 * s - 1) ** 2
 
     def slope(self, s: Array) -> Array:
         """Its derivative."""
