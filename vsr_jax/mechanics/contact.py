@@ -143,14 +143,14 @@ class Contacts(Coupling):
         force, own = note.force, x.reshape(note.force.shape)
         pushed = self.scale * note.raised + self.give * force
         rows = 0.5 * (force + pushed - self._root(force - pushed))
-        rows = jnp.where(jnp.sum(note.handed, axis=2) > 0, own, rows)
+        rows = jnp.where(note.handed != 0, own, rows)
         if self.soft is not None:
             rows = jnp.where(self.soft > 0, own - force, rows)
         return rows.reshape(x.shape)
 
     def points(self, x: Array, at: ArmState, note: Touch, problem: ArmProblem) -> PointForces:
         apart = (1 - self.give) * note.force - self.scale * note.raised
-        free = 1 - jnp.sum(note.handed, axis=2)
+        free = 1 - jnp.abs(note.handed)
         free = free if self.soft is None else (1 - self.soft) * free
         pushing = 0.5 * free * (1 + apart / self._root(apart))
         least = jnp.finfo(x.dtype).eps ** _RIGID

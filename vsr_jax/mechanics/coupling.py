@@ -31,7 +31,7 @@ from ..numerics.damped_newton import HARDENING_STAGES, LOAD_INCREMENTS, SOFT_STA
 from ..numerics.quadrature import Grid
 from .balance import without_force
 from .reaction import Loading, Reaction
-from .touch import from_cells, to_cells
+from .touch import from_cells, received, to_cells
 
 HARDENING = HARDENING_STAGES / LOAD_INCREMENTS
 """By what the fraction of the loads exceeds 1 where constraints are exact."""
@@ -143,8 +143,8 @@ class PointForces(NamedTuple):
     - `cell`: 1 for that end, else 0, shape (stages + 1, n, steps, ...); the first end of each step
       is its start.
     - `factors`, `corner`: f and c, shape (n, steps, ...).
-    - `handed`: 1 where the unknown of a step (second axis) is part of the force of another (third
-      axis), shape (n, steps, steps, ...); f is zero and c is 1 for it.
+    - `handed`: 1 or -1 where the unknown of a step is part of the force of the next or the last
+      one, else 0, shape (n, steps, ...); f is zero and c is 1 for it.
     """
 
     wrench: Array
@@ -169,8 +169,7 @@ class PointForces(NamedTuple):
         there = jnp.sum(self.cell * from_cells(motions, 1)[:, :, None], axis=1)
         moved = self.factors * jnp.sum(self.wrench * there, axis=0)
         change = (rows.reshape(moved.shape) - moved) / self.corner
-        change = change - jnp.sum(self.handed * change[:, :, None], axis=1)
-        return change.reshape(rows.shape)
+        return (change - received(self.handed, change)).reshape(rows.shape)
 
 
 class Coupling(eqx.Module):

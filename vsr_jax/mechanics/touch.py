@@ -61,9 +61,9 @@ class Touch(NamedTuple):
     contact in the world; `sigma`, its place in the step; `shares` (stages) of a force there for the
     nodes of the step; `force` [N]; `slope` (6, 6): derivative of the wrench by the motion of the
     section, at a given force; `cell` (stages + 1): 1 for that end of the cells of the nodes which
-    is nearest, the first of them the start of the step; and `lever` (3) from there; `handed`
-    (obstacles, steps, steps, *arms): 1 where the force of a step is handed on to another, since the
-    nearest point is not in it.
+    is nearest, the first of them the start of the step; and `lever` (3) from there; `handed`: 1 or
+    -1 where the force of a step is handed on to the next or the last one, since the nearest point
+    is not in it, else 0.
     """
 
     gap: Array
@@ -108,9 +108,7 @@ def touch_of(axis: Array, grid: Grid, around: Surroundings) -> Touch:
     force, slope = around.force.reshape(gap.shape), near.slope
     if around.soft is not None:
         handed = jnp.where(around.soft > 0, 0.0, handed)
-    leaves = jnp.sum(handed, axis=2)
-    arrives = jnp.sum(handed * force[:, :, None], axis=1)
-    force = (1 - leaves) * force + arrives
+    force = (1 - jnp.abs(handed)) * force + received(handed, force)
     if around.soft is None:
         slope = force * slope
     else:
@@ -190,17 +188,29 @@ def _cell_of(sigma: Array, stages: int) -> Array:
 
 
 def _handed(nearer: Array, there: Array) -> Array:
-    """For each obstacle 1 where the force of a step (second axis) belongs to another (third axis):
-    the next one, in the direction in which points are nearer, with a nearest point of its own."""
-    steps = nearer.shape[1]
-    index = jnp.arange(steps).reshape(1, -1, *(1,) * (nearer.ndim - 2))
+    """1 or -1 where the force of a step belongs to the next or the last one, which has a nearest
+    point of its own, else 0, shape (obstacles, steps, *arms).
+
+    Over more steps the forces of an arm that lies along a surface would jump to and fro."""
     own = there[None] & jnp.ones(nearer.shape, bool)
-    ahead = lax.cummin(jnp.where(own & (nearer <= 0), index, steps), axis=1, reverse=True)
-    behind = lax.cummax(jnp.where(own & (nearer >= 0), index, -1), axis=1)
-    target = jnp.where(nearer > 0, ahead, jnp.where(nearer < 0, behind, index))
-    other = (target != index) & (target >= 0) & (target < steps)
-    to = jnp.arange(steps).reshape(1, 1, -1, *(1,) * (nearer.ndim - 2))
-    return (other[:, :, None] & (target[:, :, None] == to)).astype(nearer.dtype)
+    next_own = _beside((own & (nearer <= 0)).astype(nearer.dtype), -1)
+    last_own = _beside((own & (nearer >= 0)).astype(nearer.dtype), 1)
+    return jnp.where(nearer > 0, next_own, jnp.where(nearer < 0, -last_own, 0.0))
+
+
+def _beside(x: Array, shift: int) -> Array:
+    """Values (obstacles, steps, *arms) of the steps before (1) or after (-1) each, zero at the
+    end."""
+    rest = [(0, 0)] * (x.ndim - 2)
+    if shift > 0:
+        return jnp.pad(x[:, :-1], [(0, 0), (1, 0), *rest])
+    return jnp.pad(x[:, 1:], [(0, 0), (0, 1), *rest])
+
+
+def received(handed: Array, x: Array) -> Array:
+    """What each step receives of numbers (obstacles, steps, *arms) that are handed on."""
+    forth, back = jnp.maximum(handed, 0.0) * x, jnp.maximum(-handed, 0.0) * x
+    return _beside(forth, 1) + _beside(back, -1)
 
 
 def _weights(sigma: Array, stages: int) -> tuple[Array, Array]:
