@@ -88,7 +88,7 @@ def test_a_closed_cycle_returns_to_its_turning_point():
 
 
 def test_far_from_a_reversal_it_is_the_law_of_releasing():
-    found = tips(soft(), [8.0, 1.0])[-1]
+    found = tips(soft(), [8.0] * 7 + [1.0])[-1]
     released = vsr.solve(soft(motion="release"), [1.0], model=MODEL)
     np.testing.assert_allclose(found, released.tip[:3, 3], atol=1e-9)
 
@@ -172,13 +172,16 @@ def test_without_friction_the_arm_stays_in_its_equilibrium():
 
 def test_a_sample_that_fails_is_passed_over():
     scene = soft()
-    path = vsr.follow(scene, jnp.array([2.0, -1.0, 5.0, jnp.nan, 3.0])[:, None], model=MODEL)
+    tensions = [2.0, -1.0, 5.0, jnp.nan, 3.0, 1.0, 4.0, 2.0]
+    path = vsr.follow(scene, jnp.array(tensions)[:, None], model=MODEL)
     np.testing.assert_array_equal(
         path.status,
-        [0, vsr.Status.INADMISSIBLE, 0, vsr.Status.NOT_FINITE, 0],
+        [0, vsr.Status.INADMISSIBLE, 0, vsr.Status.NOT_FINITE, 0, 0, 0, 0],
     )
     found = jax.vmap(lambda eq: eq.tip[:3, 3])(path)
-    np.testing.assert_allclose(found[::2], tips(scene, [2.0, 5.0, 3.0]), atol=1e-9)
+    alone = tips(scene, [2.0, 2.0, 5.0, 5.0, *tensions[4:]])
+    for place in (0, 2, 4, 5, 6, 7):
+        np.testing.assert_allclose(found[place], alone[place], atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -259,6 +259,7 @@ def test_the_tangents_are_the_derivative_of_the_reaction(everything):
     assert form == pytest.approx(float(jnp.sum(free * arm.tangent().times(free))), rel=1e-10)
 
 
+@pytest.mark.slow
 def test_the_energy_is_stationary(everything):
     """Its slope by a number of a load is the explicit one: half the stretch squared for a spring's
     stiffness, minus the height for a mass."""

@@ -61,6 +61,7 @@ def test_a_soft_arm_in_its_basin_takes_less_than_half_of_the_steps():
     agree(warm, cold)
 
 
+@pytest.mark.slow
 def test_tensions_and_turning_rates_start_too():
     scene = arm(partial(vsr.Tendon, control="length"), partial(vsr.Tendon, friction=0.2))
     near, moved = solved(scene, [-0.01, 1.5]), [-0.0101, 1.515]
