@@ -50,7 +50,9 @@ def pulled_in_small_steps(tensions, angle):
     return np.array(history)
 
 
-@pytest.mark.parametrize("name", ["straight, then bent", "helix"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("straight, then bent", marks=pytest.mark.slow), "helix"]
+)
 def test_tensions_in_a_rigid_sheath(name):
     scene, turned = stiff_sheath(name)
     path = vsr.follow(scene, UP_AND_DOWN[:, None], model=MODEL)
@@ -126,6 +128,7 @@ def test_gradients_by_the_past_and_by_the_friction():
     assert abs(float(backward[0][0])) < 1e-12  # except where it was overrun
 
 
+@pytest.mark.slow
 def test_lengths_with_friction():
     """Cable paid out and taken in again: the tension at the motor is lower on the way out."""
     scene = soft(control="length")

@@ -302,6 +302,7 @@ def test_two_hundred_drawn_arms_are_right_or_say_why():
     assert sum(count for said, count in counts.items() if "twice" in said) <= 4
 
 
+@pytest.mark.slow
 def test_a_strain_that_is_not_found_between_the_nodes_is_not_returned():
     """Two tendons that pull with 2.3 EA and turn half a turn per step: between the nodes Newton's
     method ended at a strain that balances nothing, thirty times smaller than the right one."""

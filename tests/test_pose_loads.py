@@ -315,6 +315,7 @@ def test_both_modes_are_the_differences_by_every_number():
     assert forward == pytest.approx(difference, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_batches_and_single_precision(everything):
     """A batch over the numbers of the loads, in both precisions."""
     where = [(0.2, 0.2, 0.1), (0.3, 0.1, 0.0), (0.25, 0.0, 0.2)]

@@ -242,7 +242,7 @@ def test_a_branch_leads_to_the_solution():
     np.testing.assert_allclose(last.tip, exact.tip, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("order", [2, pytest.param(4, marks=pytest.mark.slow), 6])
+@pytest.mark.parametrize("order", [*(pytest.param(n, marks=pytest.mark.slow) for n in (2, 4)), 6])
 def test_jumps_of_the_curvature_are_no_lack_of_steps(order):
     """Discs along an arm: the strain between them is exact without loads, and with gravity the
     estimated error is at least the true one."""
@@ -359,6 +359,7 @@ def test_wrong_arguments_are_named(unchecked):
         vsr.Rod(0.3, SECTION, material, rigid=0.1)  # pyright: ignore[reportArgumentType]
 
 
+@pytest.mark.slow
 def test_pieces_side_by_side_are_one():
     halves = rod(vsr.RigidPiece(0.13, END), vsr.RigidPiece(START, 0.13))
     joined = vsr.solve(vsr.Scene(halves, TENDONS, GRAVITY), INPUTS, model=vsr.StrainDependent(48))

@@ -100,6 +100,7 @@ def test_derivatives_are_those_without_a_start(scene, near):
         np.testing.assert_allclose(derivative(height)(inputs, near), cold, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_batch_starts_from_one_or_from_many(scene, near):
     inputs = jnp.array([[3.0, 1.5], [3.1, 1.4], [2.9, 1.6]])
     batch = jax.jit(jax.vmap(lambda u: solved(scene, u)))
