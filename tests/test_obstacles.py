@@ -481,6 +481,7 @@ def test_a_workspace_among_obstacles():
     plt.close("all")
 
 
+@pytest.mark.slow
 def test_arms_and_films_among_obstacles(tmp_path):
     """Each obstacle is one more collection; none without details."""
     model = vsr.StrainDependent(4)
