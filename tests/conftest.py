@@ -9,6 +9,7 @@ users run.
 
 import gc
 import os
+from pathlib import Path
 
 os.environ.setdefault(
     "XLA_FLAGS",
@@ -71,6 +72,16 @@ def dtype(request):
 def helix():
     """Scene B1 of the paper: one helical thread."""
     return paper.scene("B1")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def earlier_programs_are_dropped():
+    """Linux allows a process 65530 memory maps (vm.max_map_count). A compiled program keeps up to
+    hundreds of them, and XLA ends with a segmentation fault when there are no more."""
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > 20_000:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture

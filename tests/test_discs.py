@@ -85,6 +85,7 @@ def test_a_central_tendon_buckles_the_arm_between_its_discs(discs):
     assert vsr.solve(along, [1.02 * critical], model=STEPS).converged
 
 
+@pytest.mark.slow
 def test_many_discs_approach_the_path_at_second_order():
     usual = vsr.solve(scene(), TENSIONS / 3, model=vsr.StrainDependent(20), throw=True)
     errors = []
@@ -96,7 +97,7 @@ def test_many_discs_approach_the_path_at_second_order():
 
 
 def test_few_steps_between_discs_converge_with_their_order():
-    fine = vsr.solve(scene(discs=3), TENSIONS, model=vsr.StrainDependent(48), throw=True)
+    fine = vsr.solve(scene(discs=3), TENSIONS, model=FINE, throw=True)
     errors = []
     for steps in (3, 6, 12):
         eq = vsr.solve(scene(discs=3), TENSIONS, model=vsr.StrainDependent(steps), throw=True)
@@ -118,7 +119,7 @@ def test_lengths_give_back_the_tensions(weighed):
     eq = vsr.solve(driven, changes, model=FINE, throw=True)
     np.testing.assert_allclose(-eq.forces, TENSIONS, rtol=1e-9)
     np.testing.assert_allclose(eq.tip, weighed.tip, atol=1e-10)
-    loose = vsr.solve(driven, changes.at[1].set(0.03), model=STEPS, throw=True)
+    loose = vsr.solve(driven, changes.at[1].set(0.03), model=FINE, throw=True)
     assert loose.forces[1] == 0
     np.testing.assert_allclose(
         loose.slack[1], driven.rest_length(1) + 0.03 - loose.lengths[1], rtol=1e-9
@@ -170,7 +171,7 @@ def test_a_batch_is_its_arms(loads):
     arm = scene(loads, discs=3)
 
     def tip(inputs):
-        return vsr.solve(arm, inputs, model=vsr.StrainDependent(6)).tip[:3, 3]
+        return vsr.solve(arm, inputs, model=STEPS).tip[:3, 3]
 
     inputs = jnp.array([[3.0, 2.0], [0.0, 0.0], [1.0, 4.0]])
     np.testing.assert_allclose(

@@ -45,12 +45,16 @@ def error(loads, order):
         )
     )
 
-    def wrench(xi):
-        return imbalance_of(ArmUnknown(xi, ()), state_of(xi, (), problem), problem, free).wrench
+    @jax.jit
+    def change_found(problem, xi, change):
+        def wrench(xi):
+            return imbalance_of(ArmUnknown(xi, ()), state_of(xi, (), problem), problem, free).wrench
 
-    _, right = jax.jvp(wrench, (xi,), (change,))
-    at = state_of(xi, (), problem)
-    found, _, _ = approximate_solve(ArmUnknown(xi, ()), at, ArmImbalance(right, ()), problem, free)
+        _, right = jax.jvp(wrench, (xi,), (change,))
+        at, right = state_of(xi, (), problem), ArmImbalance(right, ())
+        return approximate_solve(ArmUnknown(xi, ()), at, right, problem, free)[0]
+
+    found = change_found(problem, xi, change)
     off, size = (
         sum(jnp.sum(y**2) for y in part)
         for part in (

@@ -93,6 +93,7 @@ def test_an_upright_arm_with_a_chamber_at_rest_stands_or_is_unstable():
     )
 
 
+@pytest.mark.slow
 def test_two_unstable_motions_that_the_pivots_miss_are_found(monkeypatch):
     """A dead moment makes the tangent asymmetric: two negative real eigenvalues leave all pivots of
     the elimination positive, and without the probe the equilibrium is called converged."""

@@ -48,6 +48,7 @@ def deflection():
     return jax.value_and_grad(tip, (0, 1))
 
 
+@pytest.mark.slow
 def test_reverse_mode_under_friction_is_the_difference(deflection):
     """A solution of the transposed tangent system that is judged by its residual alone was off by
     2e-4 here."""

@@ -224,6 +224,13 @@ def test_second_derivatives_are_those_of_differences(name, precision):
     np.testing.assert_allclose(found.hessian, differences(case, "gradient"), atol=allowed)
 
 
+DOUBLE_OR_SLOW = pytest.mark.parametrize(
+    "dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)], indirect=True
+)
+"""Single precision among the slow tests."""
+
+
+@DOUBLE_OR_SLOW
 def test_a_batch_of_all_cases_is_each_of_them(dtype):
     cases = list(TABLE.values())
     with np.errstate(over="ignore"):
@@ -247,6 +254,7 @@ def test_the_papers_arm_collapses_at_93_newtons(tension, status):
     assert vsr.solve(paper.scene("A1"), jnp.array([-tension]), model=MODEL).status == status
 
 
+@DOUBLE_OR_SLOW
 def test_more_steps_resolve_the_fifty_turns(dtype):
     scene, forces, *_ = TABLE["helix of fifty turns"]
 
@@ -294,6 +302,7 @@ def test_two_hundred_drawn_arms_are_right_or_say_why():
     assert sum(count for said, count in counts.items() if "twice" in said) <= 4
 
 
+@pytest.mark.slow
 def test_a_strain_that_is_not_found_between_the_nodes_is_not_returned():
     """Two tendons that pull with 2.3 EA and turn half a turn per step: between the nodes Newton's
     method ended at a strain that balances nothing, thirty times smaller than the right one."""

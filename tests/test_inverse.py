@@ -91,6 +91,7 @@ def test_least_effort_leaves_one_of_two_antagonists_slack():
     np.testing.assert_allclose(found.inputs, [5.0, 0.0], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_moving_target_is_followed_with_the_least_change_of_inputs():
     """Four tendons, one more than needed: along the direction that keeps the tip nothing moves."""
     rod = vsr.Rod(0.3, vsr.Circular(0.01), vsr.Material(8e5, poisson=0.45, density=800.0))

@@ -1,5 +1,7 @@
 """Magnus steps: their orders, poses anywhere on the arm, and the geometric Jacobian."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -116,20 +118,23 @@ class TestJacobian:
     def test_is_the_derivative_of_the_pose(self, order):
         X = jnp.asarray(0.5)
         J = vsr.jacobian(self.scene, self.basis, self.q, X, steps=12, order=order)
-        g, rates = (
-            self.pose(self.q, X, 12, order),
-            jax.jacfwd(lambda q: self.pose(q, X, 12, order))(self.q),
-        )
-        twists = jax.vmap(lambda rate: se3.vee(se3.inverse(g) @ rate), in_axes=-1, out_axes=-1)(
-            rates
-        )
-        np.testing.assert_allclose(J, twists, atol=1e-12)
+
+        @jax.jit
+        def twists(q):
+            def pose(q):
+                return self.pose(q, X, 12, order)
+
+            inverse, rates = se3.inverse(pose(q)), jax.jacfwd(pose)(q)
+            return jax.vmap(lambda rate: se3.vee(inverse @ rate), -1, -1)(rates)
+
+        np.testing.assert_allclose(J, twists(self.q), atol=1e-12)
 
     def test_is_the_integral_of_eq_15(self):
         """J = Ad_g^-1 int Ad_g B_q ds with the integral by the trapezoidal rule on fine poses,
         extrapolated once."""
         L = float(self.scene.rod.length)
 
+        @partial(jax.jit, static_argnums=0)
         def trapezoid(n):
             X = np.linspace(0, L, n + 1)
             grid = make_grid(jnp.array([0.0, L]), n, 3)

@@ -86,7 +86,9 @@ def test_parts_beside_a_piece_bend_as_if_alone():
 LOADS = {"none": (), "gravity": GRAVITY, "followers": FOLLOWERS, "spring": SPRING}
 
 
-@pytest.mark.parametrize("loads", LOADS)
+@pytest.mark.parametrize(
+    "loads", ["none", pytest.param("gravity", marks=pytest.mark.slow), "followers", "spring"]
+)
 def test_stiff_material_comes_close_as_its_compliance_does(loads):
     """Tip, lengths of threads and stability margin, with an error of first order."""
 
@@ -131,8 +133,11 @@ RUBBING = [vsr.Tendon(vsr.Helix(0.006, angle=1.0), friction=0.3), TENDONS[1]]
 
 @pytest.mark.parametrize(
     ("actuators", "loads", "inputs"),
-    [(LENGTHS, (), (-0.01, 1.5)), (LENGTHS, GRAVITY, (-0.01, 1.5)), (RUBBING, (), (3.0, 1.5))],
-    ids=["lengths", "lengths and gravity", "friction"],
+    [
+        pytest.param(LENGTHS, (), (-0.01, 1.5), marks=pytest.mark.slow, id="lengths"),
+        pytest.param(LENGTHS, GRAVITY, (-0.01, 1.5), id="lengths and gravity"),
+        pytest.param(RUBBING, (), (3.0, 1.5), id="friction"),
+    ],
 )
 def test_couplings_pass_through(actuators, loads, inputs):
     eq = vsr.solve(scene(loads, actuators), inputs, model=MODEL)
@@ -155,7 +160,14 @@ def test_a_batch_of_pieces_is_that_of_single_solves():
     np.testing.assert_allclose(jax.vmap(tip)(starts), jnp.stack(each), rtol=0, atol=1e-10)
 
 
-@pytest.mark.parametrize("loads", [(), GRAVITY, SPRING], ids=["bare", "gravity", "spring"])
+@pytest.mark.parametrize(
+    "loads",
+    [
+        pytest.param((), id="bare"),
+        pytest.param(GRAVITY, marks=pytest.mark.slow, id="gravity"),
+        pytest.param(SPRING, id="spring"),
+    ],
+)
 def test_derivatives(loads):
     """By the ends of the piece, the tension, the weight and the rest strain, which is the strain of
     the piece."""
@@ -230,7 +242,7 @@ def test_a_branch_leads_to_the_solution():
     np.testing.assert_allclose(last.tip, exact.tip, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("order", [2, 4, 6])
+@pytest.mark.parametrize("order", [*(pytest.param(n, marks=pytest.mark.slow) for n in (2, 4)), 6])
 def test_jumps_of_the_curvature_are_no_lack_of_steps(order):
     """Discs along an arm: the strain between them is exact without loads, and with gravity the
     estimated error is at least the true one."""
@@ -245,6 +257,7 @@ def test_jumps_of_the_curvature_are_no_lack_of_steps(order):
     assert error <= float(eq.error.tip) < 30 * error + 1e-10
 
 
+@pytest.mark.slow
 def test_the_continuous_model_agrees():
     continuum = vsr.Continuum(segments=6, derivative=vsr.StrainDependent(48))
     eq = vsr.solve(scene(FOLLOWERS), INPUTS, model=continuum)
@@ -253,7 +266,13 @@ def test_the_continuous_model_agrees():
     np.testing.assert_array_equal(eq.strain(0.13), [0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
 
 
-@pytest.mark.parametrize("loads", [(), GRAVITY], ids=["bare", "gravity"])
+BARE_OR_HEAVY = [
+    pytest.param((), marks=pytest.mark.slow, id="bare"),
+    pytest.param(GRAVITY, id="gravity"),
+]
+
+
+@pytest.mark.parametrize("loads", BARE_OR_HEAVY)
 def test_a_basis_counts_beside_the_pieces(loads):
     """Smooth on the part that bends, so that a higher degree converges fast."""
     arm = scene(loads, vsr.Tendon(vsr.Parallel(0.006, 0.002)), piece=vsr.RigidPiece(0.3))
@@ -272,7 +291,7 @@ def test_a_basis_counts_beside_the_pieces(loads):
     np.testing.assert_array_equal(fine.strain(0.33), [0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
 
 
-@pytest.mark.parametrize("loads", [(), GRAVITY], ids=["bare", "gravity"])
+@pytest.mark.parametrize("loads", BARE_OR_HEAVY)
 def test_a_section_of_a_basis_may_be_a_rigid_piece(loads):
     """Its coordinates are zero, and the others are those of an arm with stiff material there."""
     basis = vsr.Basis.uniform(vsr.PiecewiseConstant([0.1, START / LENGTH, END / LENGTH, 0.7]))
@@ -340,6 +359,7 @@ def test_wrong_arguments_are_named(unchecked):
         vsr.Rod(0.3, SECTION, material, rigid=0.1)  # pyright: ignore[reportArgumentType]
 
 
+@pytest.mark.slow
 def test_pieces_side_by_side_are_one():
     halves = rod(vsr.RigidPiece(0.13, END), vsr.RigidPiece(START, 0.13))
     joined = vsr.solve(vsr.Scene(halves, TENDONS, GRAVITY), INPUTS, model=vsr.StrainDependent(48))

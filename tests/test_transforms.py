@@ -147,9 +147,11 @@ def test_a_scene_may_be_built_under_jit():
 @pytest.mark.parametrize(
     "quantity",
     [
-        *(pytest.param(name, marks=pytest.mark.slow) for name in ("position", "reaction")),
         "strain",
-        "thread",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("position", "reaction", "thread")
+        ),
     ],
 )
 def test_traced_places_beyond_the_arm_are_nan_and_harm_no_others(quantity):

@@ -61,6 +61,7 @@ def test_a_soft_arm_in_its_basin_takes_less_than_half_of_the_steps():
     agree(warm, cold)
 
 
+@pytest.mark.slow
 def test_tensions_and_turning_rates_start_too():
     scene = arm(partial(vsr.Tendon, control="length"), partial(vsr.Tendon, friction=0.2))
     near, moved = solved(scene, [-0.01, 1.5]), [-0.0101, 1.515]
@@ -99,6 +100,7 @@ def test_derivatives_are_those_without_a_start(scene, near):
         np.testing.assert_allclose(derivative(height)(inputs, near), cold, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_batch_starts_from_one_or_from_many(scene, near):
     inputs = jnp.array([[3.0, 1.5], [3.1, 1.4], [2.9, 1.6]])
     batch = jax.jit(jax.vmap(lambda u: solved(scene, u)))
