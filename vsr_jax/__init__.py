@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         check,
         compliance,
         compliance_ellipsoid,
+        constraint,
         follow,
         follow_branch,
         manipulability,
@@ -106,7 +107,7 @@ if TYPE_CHECKING:
     )
     from .models.continuum import Continuum
     from .numerics import se3, step_twist, zanna_step
-    from .optimization import constraint, objective
+    from .optimization import objective
     from .optimization.design_search import Design, design
     from .optimization.search import Search
     from .solution import (

@@ -1,9 +1,10 @@
-"""Results that need many solves: derivatives, inverse statics, health, branches of equilibria,
-sweeps.
+"""Results that need many solves: derivatives, constraints, inverse statics, health, branches of
+equilibria, sweeps.
 
 Does not import optimizers or plotting.
 """
 
+from . import constraint
 from .branches import Branch, follow_branch
 from .derivatives import (
     Ellipsoid,
@@ -29,6 +30,7 @@ __all__ = [
     "check",
     "compliance",
     "compliance_ellipsoid",
+    "constraint",
     "follow",
     "follow_branch",
     "manipulability",
