@@ -146,18 +146,17 @@ class StabilityMargin(Constraint):
 
 
 class Clearance(Constraint):
-    r"""Distance to obstacles: $(g - \lambda / k - d) / \rho$ with the gap g between an obstacle and
-    the outline of the arm, of radius $\rho$.
+    r"""Distance to obstacles: $(g - \lambda / k - d) / L$ with the gap g between an obstacle and
+    the outline of the arm.
 
-    Of the obstacles of the scene the gaps are those of `eq.contacts`, on each step. An arm that
-    touches them has $g = 0$ however hard it presses; there the contact force $\lambda$ over the
-    stiffness $k = 3 EI / L^3$ of the arm, a cantilever, tells how far it is from coming free. With
-    d = 0 the arm may touch, but not press.
+    Of the obstacles of the scene the gaps are those of `eq.contacts`, on each step. Where the arm
+    touches them g is zero however hard it presses, and the contact force $\lambda$ shows the way
+    out; $k = 3 EI / L^3$ is the stiffness of the arm as a cantilever. With d = 0 the arm may touch,
+    but not press.
 
-    Other `obstacles`, which the scene does not have, do not push the arm. It may be inside them
-    where the constraint is violated, and is free where it is satisfied. This takes all models, and
-    a tenth of the time or less: contact is not solved. The gap is the least one near each of 65
-    stations along the arm.
+    Other `obstacles`, which the scene does not have, do not push the arm: where the constraint is
+    violated the arm may be inside them. Contact is then not solved, which takes all models and a
+    tenth of the time or less. The gap is the least one near each of 65 stations along the arm.
 
     **Arguments:** `distance`: d [m]. `obstacles`: from which to keep clear; by default those of the
     scene.
@@ -176,30 +175,24 @@ class Clearance(Constraint):
                 raise ValueError(f"Clearance.obstacles: got none, need {needed}")
 
     def __call__(self, arms: Arms) -> Float[Array, " margins"]:
-        if self.obstacles is None:
-            gaps, radius = _gaps_of_contacts(arms)
-        else:
-            gaps, radius = _gaps_of_stations(arms, self.obstacles)
-        return ((gaps - self.distance) / radius).reshape(-1)
+        gaps = _pressed(arms) if self.obstacles is None else _gaps(arms, self.obstacles)
+        return ((gaps - self.distance) / arms.scene.rod.length).reshape(-1)
 
 
-def _gaps_of_contacts(arms: Arms) -> tuple[Array, Array]:
-    """Gap to each obstacle of the scene on each step, negative where the arm presses, and the
-    radius of the outline there [m]."""
+def _pressed(arms: Arms) -> Float[Array, "sets obstacles steps"]:
+    """Gaps to the obstacles of the scene on each step [m], negative where the arm presses."""
     contacts = _contacts(arms, "Clearance", "in the scene or in Clearance(distance, obstacles)")
-    rod, X = arms.scene.rod, contacts.X
+    rod = arms.scene.rod
     bending = softest(jax.vmap(rod.stiffness)(_stations(arms)))
-    stiffness = 3 * jnp.mean(bending) / rod.length**3
-    radius = jax.vmap(rod.outline)(X.reshape(-1)).reshape(X.shape)
-    return contacts.gap - contacts.force / stiffness, radius
+    return contacts.gap - contacts.force * rod.length**3 / (3 * jnp.mean(bending))
 
 
-def _gaps_of_stations(arms: Arms, obstacles: tuple[Obstacle, ...]) -> tuple[Array, Array]:
-    """Gap to each obstacle near each station, and the radius of the outline there [m]."""
+def _gaps(arms: Arms, obstacles: tuple[Obstacle, ...]) -> Float[Array, "obstacles sets stations"]:
+    """Least gap [m] to each obstacle near each station."""
     X = _stations(arms)
     places, radius = arms.each(lambda eq: eq.position(X)), jax.vmap(arms.scene.rod.outline)(X)
     distances = [jax.vmap(jax.vmap(one.distance))(places) for one in obstacles]
-    return _least(jnp.stack(distances) - radius), radius
+    return _least(jnp.stack(distances) - radius)
 
 
 def _contacts(arms: Arms, name: str, where: str) -> Contact:

@@ -1,0 +1,130 @@
+"""Designs and inverse statics that keep clear of obstacles, or press on them with at most a force:
+margins against distances in NumPy, their derivatives against differences."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import vsr_jax as vsr
+from vsr_jax.analysis.arms import Arms
+from vsr_jax.analysis.constraint import Clearance, MaxContactForce
+
+L, RADIUS = 0.3, 0.008
+MODEL = vsr.StrainDependent(8)
+OFFSETS = ((0.006, 0.0), (-0.003, 0.0052), (-0.003, -0.0052))
+ROD = vsr.Rod(L, vsr.Circular(vsr.Taper(RADIUS, 0.007)), vsr.Material(8e5, poisson=0.45))
+TENDONS = [vsr.Tendon(vsr.Parallel(y, z)) for y, z in OFFSETS]
+FREE = vsr.Scene(ROD, TENDONS)
+BALL = vsr.Sphere((0.2, 0.06, 0.0), 0.03)
+BOX = vsr.Box((0.05, 0.05, 0.05), pose=vsr.pose((0.15, -0.07, 0.05), pointing=(1.0, 0.5, 0.2)))
+AMONG = vsr.Scene(ROD, TENDONS, obstacles=[BALL])
+BESIDE = jnp.array([0.8, 0.1, 0.6])
+INTO = jnp.array([1.0, 0.2, 0.2])
+"""Inputs that bend the arm beside the ball, and into it."""
+
+
+DENSE = np.linspace(0, L, 4001)
+
+
+@jax.jit
+def bare(inputs):
+    return vsr.solve(FREE, inputs, model=MODEL)
+
+
+def gap_to_ball(eq, X=DENSE):
+    """Gap between the ball and the outline of an arm."""
+    away = np.linalg.norm(np.asarray(eq.position(X)) - [0.2, 0.06, 0.0], axis=1)
+    return away - 0.03 - (RADIUS + (0.007 - RADIUS) * X / L)
+
+
+def gap_to_box(eq, X=DENSE):
+    pose = np.asarray(BOX.pose)
+    local = np.abs((np.asarray(eq.position(X)) - pose[:3, 3]) @ pose[:3, :3]) - 0.025
+    away = np.linalg.norm(np.maximum(local, 0), axis=1) + np.minimum(local.max(axis=1), 0)
+    return away - (RADIUS + (0.007 - RADIUS) * X / L)
+
+
+def gaps_of(eq):
+    """Gaps that the margins mean, (obstacles, stations)."""
+    return Clearance(0.004, [BALL, BOX])(Arms.of(eq)).reshape(2, 65) * L + 0.004
+
+
+def test_the_clearance_is_that_of_the_nearest_point():
+    """Between the 65 stations as well."""
+    eq = bare(BESIDE)
+    for gaps, dense in zip(gaps_of(eq), (gap_to_ball, gap_to_box), strict=True):
+        assert float(jnp.min(gaps)) == pytest.approx(np.min(dense(eq)), abs=1e-5 * L)
+        at_stations = dense(eq, np.linspace(0, L, 65))
+        np.testing.assert_allclose(gaps, at_stations, atol=L / 128)
+        assert np.all(gaps <= at_stations + 1e-12)
+
+
+def test_derivatives_of_the_clearance():
+    def least(inputs):
+        return jnp.min(gaps_of(vsr.solve(FREE, inputs, model=MODEL)))
+
+    slope = jax.jit(jax.grad(least))(BESIDE)
+    h = 1e-4 * np.eye(3)
+    ahead, behind = ([np.min(gap_to_ball(bare(BESIDE + s * x))) for x in h] for s in (1, -1))
+    differences = (np.array(ahead) - behind) / 2e-4
+    np.testing.assert_allclose(slope, differences, rtol=2e-3)
+
+
+@pytest.fixture(scope="module")
+def touching():
+    """The arm that leans on the ball, and the one beside it, with margins and their slopes."""
+
+    @jax.jit
+    def of(inputs):
+        def margins(inputs):
+            eq = vsr.solve(AMONG, inputs, model=MODEL)
+            arms = Arms.of(eq)
+            both = jnp.stack(
+                [jnp.min(Clearance(0.004)(arms)), jnp.min(MaxContactForce(0.05)(arms))]
+            )
+            return both, (both, eq)
+
+        slope, (both, eq) = jax.jacfwd(margins, has_aux=True)(inputs)
+        return eq, both, slope
+
+    return of
+
+
+def test_clearance_of_an_arm_that_touches(touching):
+    """Where it presses the margin is that of the force, with EI / L^3 of the arm; else of the
+    gap."""
+    eq, margins, slope = touching(INTO)
+    force = float(jnp.sum(eq.contacts.force))
+    assert force > 0.01
+    X = np.linspace(0, L, 65)
+    stiffness = 3 * np.mean(8e5 * np.pi / 4 * (RADIUS + (0.007 - RADIUS) * X / L) ** 4) / L**3
+    i = int(jnp.argmax(eq.contacts.force[0]))
+    worst = -(float(eq.contacts.force[0, i]) / stiffness + 0.004) / L
+    np.testing.assert_allclose(margins, [worst, 1 - force / 0.05], rtol=1e-6)
+    h = 1e-4 * np.eye(3)
+    differences = [(touching(INTO + x)[1] - touching(INTO - x)[1]) / 2e-4 for x in h]
+    np.testing.assert_allclose(slope, np.transpose(differences), rtol=1e-4, atol=1e-6)
+    beside, margins, _ = touching(BESIDE)
+    free = (np.min(gap_to_ball(beside)) - 0.004) / L
+    np.testing.assert_allclose(margins, [free, 1.0], atol=1e-6)
+
+
+def test_a_design_comes_free_of_an_obstacle():
+    """The tip is to go where only an arm inside the ball brings it."""
+    aim = vsr.objective.TipError(bare(INTO).tip[None, :3, 3])
+    found = vsr.design(
+        FREE,
+        {"inputs": (0.0, 3.0)},
+        aim,
+        INTO[None],
+        constraints=[Clearance(0.004, BALL)],
+        model=MODEL,
+        search=vsr.Search(starts=2, steps=150, candidates=4),
+        progress=False,
+    )
+    assert np.min(gap_to_ball(bare(INTO))) < -0.02
+    assert found.feasible
+    assert "Clearance(distance=0.004, obstacles=[Sphere])" in found.margins
+    # the constraint binds
+    assert 0.004 <= np.min(gap_to_ball(bare(found.inputs[0]))) < 0.0041
