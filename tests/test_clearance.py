@@ -1,6 +1,8 @@
 """Designs and inverse statics that keep clear of obstacles, or press on them with at most a force:
 margins against distances in NumPy, their derivatives against differences."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +11,7 @@ import pytest
 import vsr_jax as vsr
 from vsr_jax.analysis.arms import Arms
 from vsr_jax.analysis.constraint import Clearance, MaxContactForce
+from vsr_jax.optimization.design_file import load_design
 
 L, RADIUS = 0.3, 0.008
 MODEL = vsr.StrainDependent(8)
@@ -128,3 +131,116 @@ def test_a_design_comes_free_of_an_obstacle():
     assert "Clearance(distance=0.004, obstacles=[Sphere])" in found.margins
     # the constraint binds
     assert 0.004 <= np.min(gap_to_ball(bare(found.inputs[0]))) < 0.0041
+
+
+@pytest.mark.slow
+def test_a_design_comes_free_of_an_obstacle_that_it_touches():
+    eq = vsr.solve(AMONG, INTO, model=MODEL)
+    for kept, least, most in ((Clearance(0.004), 0.004, 0.0042), (MaxContactForce(0.01), 0, 1e-5)):
+        found = vsr.design(
+            AMONG,
+            {"inputs": (0.0, 3.0)},
+            vsr.objective.TipError(eq.tip[None, :3, 3]),
+            INTO[None],
+            constraints=[kept],
+            model=MODEL,
+            search=vsr.Search(starts=1, steps=150, candidates=1),
+            progress=False,
+        )
+        assert found.feasible
+        there = vsr.solve(AMONG, found.inputs[0], model=MODEL)
+        assert least <= np.min(gap_to_ball(there)) < most
+        assert float(jnp.sum(there.contacts.force)) < 0.01
+
+
+@pytest.fixture(scope="module")
+def two_parts():
+    """Six tendons, three of them up to the middle: more than a position of the tip needs."""
+    half = [vsr.Tendon(vsr.Parallel(y, z), end=L / 2) for y, z in OFFSETS]
+    return vsr.Scene(ROD, [*half, *TENDONS])
+
+
+@pytest.mark.slow
+def test_an_arm_reaches_past_an_obstacle(two_parts):
+    known = jnp.array([0.6, 0.1, 0.2, 0.6, 0.1, 0.3])
+    aim = vsr.solve(two_parts, known, model=MODEL)
+    place = aim.position(0.2) + jnp.array([0.0, 0.0, 0.026])
+    ball = vsr.Sphere(place, 0.01)
+    kept = [Clearance(0.003, ball)]
+    far = jnp.array([0.5, 0.0, 0.0])
+    targets = jnp.stack([aim.tip[:3, 3], far])
+    found = jax.vmap(lambda x: vsr.reach(two_parts, x, (0.0, 3.0), constraints=kept, model=MODEL))(
+        targets
+    )
+    near, nearest = (jax.tree.map(lambda x, i=i: x[i], found) for i in (0, 1))
+    assert bool(near.reached)
+    assert not bool(nearest.reached)
+    for one in (near, nearest):
+        axis = np.asarray(one.equilibrium.position(DENSE))
+        radius = RADIUS + (0.007 - RADIUS) * DENSE / L
+        gap = np.linalg.norm(axis - np.asarray(place), axis=1) - 0.01 - radius
+        assert np.min(gap) > 0.003
+    assert "violation" not in str(near)
+
+
+def test_a_reach_prints_a_violation():
+    zero, one = jnp.zeros(()), jnp.ones(())
+    found = vsr.Reach(jnp.ones(3), bare(BESIDE), zero, jnp.array(False), one, jnp.array(0.02))
+    assert str(found).splitlines()[1:] == [
+        "miss       0 m, within the 1 m allowed",
+        "violation  0.02, the constraints do not hold",
+    ]
+
+
+def test_a_design_file_has_obstacles(tmp_path):
+    vsr.save(AMONG, tmp_path / "arm.toml", INTO)
+    file = tmp_path / "design.toml"
+    file.write_text(
+        """
+        scene = "arm.toml"
+        free.inputs = [0.0, 3.0]
+        objectives = [{ type = "Tension", scale = 1.0 }]
+        [[constraints]]
+        type = "MaxContactForce"
+        force = 0.1
+        [[constraints]]
+        type = "Clearance"
+        distance = 0.002
+        obstacles = [{ type = "Sphere", centre = [0.2, 0.06, 0.0], radius = 0.03 }]
+        """
+    )
+    force, kept = load_design(file).constraints
+    assert str(force) == "MaxContactForce(force=0.1)"
+    assert str(kept) == "Clearance(distance=0.002, obstacles=[Sphere])"
+    assert str(Clearance(0.002)) == "Clearance(distance=0.002)"
+    np.testing.assert_array_equal(kept.obstacles[0].centre, BALL.centre)
+    file.write_text(file.read_text().replace('"Sphere"', '"Ball"'))
+    with pytest.raises(ValueError, match=r"constraints\[1\].obstacles\[0\]: unknown type 'Ball'"):
+        load_design(file)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Clearance(-0.1), "Clearance.distance: got -0.1, need"),
+        (lambda: Clearance(0.1, []), "Clearance.obstacles: got none, need a Plane, Sphere, Tube"),
+        (lambda: Clearance(0.1, [1.0]), "Clearance.obstacles[0]: got 1.0, need a Plane, Sphere"),
+        (lambda: MaxContactForce(0.0), "MaxContactForce.force: got 0.0, need a finite number > 0"),
+        (
+            lambda: Clearance(0.1)(Arms.of(bare(BESIDE))),
+            "Clearance: got a scene without obstacles, need obstacles in the scene or in "
+            "Clearance(distance, obstacles)",
+        ),
+        (
+            lambda: MaxContactForce(0.1)(Arms.of(bare(BESIDE))),
+            "MaxContactForce: got a scene without obstacles, need obstacles in the scene",
+        ),
+        (
+            lambda: vsr.reach(FREE, jnp.zeros(3), (0.0, 1.0), constraints=[BALL]),
+            "constraints[0]: got Sphere(",
+        ),
+    ],
+)
+def test_errors_name_the_value_and_the_requirement(unchecked, make, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        make()

@@ -155,8 +155,8 @@ class Clearance(Constraint):
     but not press.
 
     Other `obstacles`, which the scene does not have, do not push the arm: where the constraint is
-    violated the arm may be inside them. Contact is then not solved, which takes all models and a
-    tenth of the time or less. The gap is the least one near each of 65 stations along the arm.
+    violated the arm may be inside them. Contact is then not solved: any model will do, and the time
+    is a tenth or less. The gap is the least one near each of 65 stations along the arm.
 
     **Arguments:** `distance`: d [m]. `obstacles`: from which to keep clear; by default those of the
     scene.
