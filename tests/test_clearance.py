@@ -183,6 +183,36 @@ def test_an_arm_reaches_past_an_obstacle(two_parts):
     assert "violation" not in str(near)
 
 
+@pytest.mark.slow
+def test_a_path_leads_round_an_obstacle():
+    """The straight line leads through a ball; with the ball elsewhere it is the path."""
+    first, last = jnp.array([0.2, 0.05, 1.0]), jnp.array([0.2, 1.0, 0.05])
+    middle = bare((first + last) / 2).tip[:3, 3] + jnp.array([0.0, 0.0, 0.002])
+
+    def found(centre):
+        kept = [Clearance(0.003, vsr.Sphere(centre, 0.012))]
+        return vsr.find_path(FREE, first, last, (0.0, 3.0), kept, samples=17, model=MODEL)
+
+    path = found(middle)
+    assert bool(path.feasible)
+    assert float(path.violation) == 0
+    assert str(path) == "17 samples from 0.2, 0.05, 1 to 0.2, 1, 0.05: all constraints hold"
+    np.testing.assert_allclose(path.inputs[0], first, atol=1e-12)
+    np.testing.assert_allclose(path.inputs[-1], last, atol=1e-12)
+    assert np.all((path.inputs >= 0) & (path.inputs <= 3))
+    again = jax.vmap(bare)(path.inputs)
+    places = np.asarray(jax.vmap(lambda eq: eq.position(DENSE))(again))
+    radius = RADIUS + (0.007 - RADIUS) * DENSE / L
+    gaps = np.linalg.norm(places - np.asarray(middle), axis=-1) - 0.012 - radius
+    assert 0.003 < np.min(gaps) < 0.004
+    free = found(jnp.array([0.0, 0.0, 0.3]))
+    straight = first + jnp.linspace(0, 1, 17)[:, None] * (last - first)
+    np.testing.assert_allclose(free.inputs, straight, atol=1e-6)
+    shut = found(bare(first).tip[:3, 3])
+    assert not bool(shut.feasible)
+    assert "NO PATH FOUND" in str(shut)
+
+
 def test_a_reach_prints_a_violation():
     zero, one = jnp.zeros(()), jnp.ones(())
     found = vsr.Reach(jnp.ones(3), bare(BESIDE), zero, jnp.array(False), one, jnp.array(0.02))
@@ -238,6 +268,18 @@ def test_a_design_file_has_obstacles(tmp_path):
         (
             lambda: vsr.reach(FREE, jnp.zeros(3), (0.0, 1.0), constraints=[BALL]),
             "constraints[0]: got Sphere(",
+        ),
+        (
+            lambda: vsr.find_path(FREE, BESIDE, INTO, (0.0, 3.0), []),
+            "constraints: got none, need at least one",
+        ),
+        (
+            lambda: vsr.find_path(FREE, BESIDE, INTO, (0.0, 0.9), Clearance(0.1, BALL)),
+            "last: got [1.  0.2 0.2], need inputs between [0. 0. 0.] and [0.9 0.9 0.9]",
+        ),
+        (
+            lambda: vsr.find_path(FREE, BESIDE, INTO, (0.0, 3.0), Clearance(0.1, BALL), samples=2),
+            "samples: got 2, need an integer >= 3",
         ),
     ],
 )

@@ -18,12 +18,14 @@ from .derivatives import (
 from .following import follow
 from .health import Health, check
 from .inverse import Reach, reach
+from .path_finding import InputPath, find_path
 from .sweeping import Sweep, sweep
 
 __all__ = [
     "Branch",
     "Ellipsoid",
     "Health",
+    "InputPath",
     "Reach",
     "Sensitivity",
     "Sweep",
@@ -31,6 +33,7 @@ __all__ = [
     "compliance",
     "compliance_ellipsoid",
     "constraint",
+    "find_path",
     "follow",
     "follow_branch",
     "manipulability",

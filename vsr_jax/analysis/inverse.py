@@ -31,8 +31,8 @@ from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
 from ..typing import Pose, Scalar, cast
 from ..validation import instance, instances, interval, is_traced, numbers, on_arm, positive, rigid
-from .arms import Arms
 from .constraint import Constraint
+from .margins import margins_of, shortfall, violation
 from .progress import compiling, message_when_slow
 
 _SAMPLES, _STARTS = 512, 6
@@ -42,9 +42,6 @@ _CLOSE_ENOUGH = {"float64": 1e-6, "float32": 1e-3}
 _SAME_BASIN = 0.1
 """Distance, relative to the diagonal of the box of shares, within which inputs are assumed to lead
 to the same minimum."""
-_INSIDE, _STRICT = 1e-4, 100.0
-r"""Margin $\epsilon$ that constraints are to have, and their weight v: they then hold at what is
-found, also where the target is out of reach."""
 
 
 class Reach(NamedTuple):
@@ -204,22 +201,17 @@ class _ReachProblem(NamedTuple):
             [places[:3, 3] - self.target[:3, 3], self.scene.rod.length * rotation_vector(turn)]
         )
 
-    def margins(self, eq: Equilibrium) -> Array:
-        """Margins of all constraints, shape (margins,)."""
-        arms = Arms.of(eq)
-        return jnp.concatenate([constraint(arms) for constraint in self.constraints])
-
     def seen(self, share: Array) -> tuple[Array, Array | None]:
         """What the residual depends on, at shares of the range: places and margins."""
         eq = self.at(share)
-        return self.places(eq), self.margins(eq) if self.constraints else None
+        return self.places(eq), margins_of(self.constraints, eq) if self.constraints else None
 
     def residual_of(self, places: Array, margins: Array | None) -> Array:
         """Differences from the target relative to the arm's length, and what the margins lack."""
         misses = self.misses(places) / self.scene.rod.length
         if margins is None:
             return misses
-        return jnp.concatenate([misses, _STRICT * jnp.maximum(_INSIDE - margins, 0.0)])
+        return jnp.concatenate([misses, shortfall(margins)])
 
     def residual(self, share: Array) -> Array:
         """Residual at shares of the range."""
@@ -277,17 +269,11 @@ def _reach(problem: _ReachProblem, allowed: Scalar) -> Reach:
     there = problem.at(share)
     miss = norm(split(problem.misses(problem.places(there))))
     miss = jnp.where(jnp.isfinite(miss), miss, jnp.inf)
-    violation = _violation(problem, there)
-    reached = (miss <= allowed) & (violation <= 0)
-    return Reach(problem.inputs(share), there, miss, reached, allowed, violation)
-
-
-def _violation(problem: _ReachProblem, eq: Equilibrium) -> Scalar:
-    """Largest violation of a constraint, infinite without an equilibrium."""
-    if not problem.constraints:
-        return jnp.zeros_like(problem.scene.rod.length)
-    least = jnp.min(problem.margins(eq))
-    return jnp.where(jnp.isfinite(least), jnp.maximum(-least, 0.0), jnp.inf)
+    violated = jnp.zeros_like(miss)
+    if problem.constraints:
+        violated = violation(margins_of(problem.constraints, there))
+    reached = (miss <= allowed) & (violated <= 0)
+    return Reach(problem.inputs(share), there, miss, reached, allowed, violated)
 
 
 def _starts(problem: _ReachProblem) -> Float[Array, "starts inputs"]:
