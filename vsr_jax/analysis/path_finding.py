@@ -189,8 +189,13 @@ def _find_path(problem: _PathProblem) -> InputPath:
     compiling()
     rest = problem.straight[1:-1].reshape(-1)
     enough = jnp.asarray(_ENOUGH, rest.dtype)
-    found = bounded_least_squares.nearest(problem.residual, _starts(problem, rest), rest, enough)
-    share = lax.stop_gradient(found.share)
+
+    def nearest(_: int, starts: Array) -> Array:
+        found = bounded_least_squares.nearest(problem.residual, starts, rest, enough)
+        return jnp.broadcast_to(found.share, starts.shape)
+
+    # again from there, with all weights: only the first start of a search has them
+    share = lax.stop_gradient(lax.fori_loop(0, 2, nearest, _starts(problem, rest))[0])
     there = problem.at(share)
     violated = violation(problem.margins(there))
     return InputPath(problem.inputs(share), there, violated, violated <= 0)
