@@ -130,7 +130,7 @@ def find_path(
     curve = jnp.asarray(_bernstein(samples, count("bends", bends) + 1), start.dtype)
     problem = _PathProblem(scene, start, end, low, high, kept, model, curve)
     with message_when_slow("vsr_jax.find_path: compiling", start=False, shown=progress):
-        return _find_path(lax.stop_gradient(problem))
+        return _find_path(problem)
 
 
 def _check_within(name: str, inputs: Array, low: Array, high: Array) -> None:
@@ -187,6 +187,8 @@ class _PathProblem(NamedTuple):
 @eqx.filter_jit
 def _find_path(problem: _PathProblem) -> InputPath:
     compiling()
+    arrays, others = eqx.partition(problem, eqx.is_inexact_array)
+    problem = eqx.combine(lax.stop_gradient(arrays), others)
     rest = problem.straight[1:-1].reshape(-1)
     enough = jnp.asarray(_ENOUGH, rest.dtype)
 
@@ -195,7 +197,7 @@ def _find_path(problem: _PathProblem) -> InputPath:
         return jnp.broadcast_to(found.share, starts.shape)
 
     # again from there, with all weights: only the first start of a search has them
-    share = lax.stop_gradient(lax.fori_loop(0, 2, nearest, _starts(problem, rest))[0])
+    share = lax.fori_loop(0, 2, nearest, _starts(problem, rest))[0]
     there = problem.at(share)
     violated = violation(problem.margins(there))
     return InputPath(problem.inputs(share), there, violated, violated <= 0)
