@@ -91,8 +91,9 @@ def find_path(
         )
 
     The path $u(t) = \sum_i \binom{n}{i} t^i (1 - t)^{n-i} c_i$ is a smooth Bézier curve. The search
-    starts near the straight line, then further away. Constraints hold at the samples: take so many
-    that the arm moves less between two of them than the distance that it is to keep.
+    starts near the straight line, then further away. Constraints hold at the samples;
+    between them the arm may come closer. A path takes seconds, or minutes where the way is narrow
+    or there are many actuators.
 
     All samples are solved on their own, side by side. Where an arm has several equilibria, find out
     with `follow(scene, path.inputs)` whether it stays in these.
@@ -192,7 +193,7 @@ def _find_path(problem: _PathProblem) -> InputPath:
     rest = problem.straight[1:-1].reshape(-1)
     enough = jnp.asarray(_ENOUGH, rest.dtype)
 
-    def nearest(_: int, starts: Array) -> Array:
+    def nearest(_: Array, starts: Array) -> Array:
         found = bounded_least_squares.nearest(problem.residual, starts, rest, enough)
         return jnp.broadcast_to(found.share, starts.shape)
 
