@@ -79,7 +79,7 @@ def follow(rounds: int) -> dict[str, Any]:
     around = [vsr.Tendon(vsr.Parallel(0.007 * np.cos(a), 0.007 * np.sin(a))) for a in angles]
     scene, tense = vsr.Scene(rod, around, [vsr.Gravity()]), jnp.array([6.0, 3.0, 2.0, 2.0])
     eq, zero = vsr.solve(scene, tense, model=MODEL), jnp.zeros(())
-    first = vsr.Reach(tense, eq, zero, jnp.array(True), zero)
+    first = vsr.Reach(tense, eq, zero, jnp.array(True), zero, zero)
     angle = 0.1 * jnp.arange(100)[:, None]  # on a circle of 1 cm
     circle = 0.01 * jnp.concatenate([0 * angle, jnp.sin(angle), jnp.cos(angle) - 1], axis=1)
     targets = eq.tip[:3, 3] + circle

@@ -9,14 +9,14 @@ import optax
 import pytest
 
 import vsr_jax as vsr
-from vsr_jax.optimization import checkpoint
-from vsr_jax.optimization.constraint import (
+from vsr_jax.analysis.constraint import (
     BendRadius,
     Inside,
     MaxTension,
     MinSpacing,
     StabilityMargin,
 )
+from vsr_jax.optimization import checkpoint
 from vsr_jax.optimization.descent import History
 from vsr_jax.optimization.objective import (
     Arms,

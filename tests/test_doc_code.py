@@ -26,7 +26,8 @@ ELSEWHERE = {
     DOCS / "live_view.md",
 }
 SLOW = {
-    DOCS / "guides" / f"{name}.md" for name in ("catheter", "pneumatic_arm", "calibrate", "design")
+    DOCS / "guides" / f"{name}.md"
+    for name in ("catheter", "pneumatic_arm", "calibrate", "design", "obstacles")
 }
 """Arms under loads, fits and designs compile for long."""
 BLOCK = re.compile(

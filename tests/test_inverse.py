@@ -103,7 +103,7 @@ def test_a_moving_target_is_followed_with_the_least_change_of_inputs():
     tense = jnp.array([4.0, 2.5, 2.0, 3.0])
     eq = vsr.solve(scene, tense, model=model)
     zero = jnp.zeros(())
-    here = vsr.Reach(tense, eq, zero, jnp.array(True), zero)
+    here = vsr.Reach(tense, eq, zero, jnp.array(True), zero, zero)
     target = eq.tip[:3, 3] + jnp.array([0.0, 1e-3, 2e-3])
     track = jax.jit(lambda t, start: vsr.reach(scene, t, (0.0, 8.0), model=model, start=start))
     found = track(target, here)
@@ -120,7 +120,8 @@ def test_a_moving_target_is_followed_with_the_least_change_of_inputs():
 
 def test_a_start_with_other_actuators_is_refused(scene, reached):
     eq = vsr.solve(vsr.Scene(scene.rod, []), [])
-    start = vsr.Reach(jnp.zeros(0), eq, jnp.zeros(()), jnp.array(True), jnp.zeros(()))
+    zero = jnp.zeros(())
+    start = vsr.Reach(jnp.zeros(0), eq, zero, jnp.array(True), zero, zero)
     with pytest.raises(ValueError, match="start: got inputs of shape"):
         vsr.reach(scene, jnp.zeros(3), (0.0, 1.0), start=start)
 
@@ -261,6 +262,7 @@ def test_the_command(tmp_path, capsys, monkeypatch, scene, close):
             miss,
             jnp.array(close),
             jnp.array(allowed_miss),
+            jnp.array(0.0),
         )
 
     monkeypatch.setattr(inverse, "reach", reach)

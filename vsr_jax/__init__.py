@@ -9,12 +9,15 @@ if TYPE_CHECKING:
         Branch,
         Ellipsoid,
         Health,
+        InputPath,
         Reach,
         Sensitivity,
         Sweep,
         check,
         compliance,
         compliance_ellipsoid,
+        constraint,
+        find_path,
         follow,
         follow_branch,
         manipulability,
@@ -106,7 +109,7 @@ if TYPE_CHECKING:
     )
     from .models.continuum import Continuum
     from .numerics import se3, step_twist, zanna_step
-    from .optimization import constraint, objective
+    from .optimization import objective
     from .optimization.design_search import Design, design
     from .optimization.search import Search
     from .solution import (
@@ -158,6 +161,7 @@ __all__ = [
     "Health",
     "Held",
     "Helix",
+    "InputPath",
     "Joined",
     "Legendre",
     "LikelihoodProfile",
@@ -220,6 +224,7 @@ __all__ = [
     "design",
     "export",
     "film",
+    "find_path",
     "fit",
     "follow",
     "follow_branch",

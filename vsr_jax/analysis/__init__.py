@@ -1,9 +1,10 @@
-"""Results that need many solves: derivatives, inverse statics, health, branches of equilibria,
-sweeps.
+"""Results that need many solves: derivatives, constraints, inverse statics, health, branches of
+equilibria, sweeps.
 
 Does not import optimizers or plotting.
 """
 
+from . import constraint
 from .branches import Branch, follow_branch
 from .derivatives import (
     Ellipsoid,
@@ -17,18 +18,22 @@ from .derivatives import (
 from .following import follow
 from .health import Health, check
 from .inverse import Reach, reach
+from .path_finding import InputPath, find_path
 from .sweeping import Sweep, sweep
 
 __all__ = [
     "Branch",
     "Ellipsoid",
     "Health",
+    "InputPath",
     "Reach",
     "Sensitivity",
     "Sweep",
     "check",
     "compliance",
     "compliance_ellipsoid",
+    "constraint",
+    "find_path",
     "follow",
     "follow_branch",
     "manipulability",

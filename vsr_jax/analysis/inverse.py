@@ -1,9 +1,10 @@
 r"""Inverse statics: inputs that bring an arm's tip, or points along the arm, to target positions.
 
-$\min_s \sum_j |x_j(s) - x_j^*|^2 / L^2 + w^2 \sum_i (s_i - s_{0i})^2, \quad
-u = u_0 + (u_1 - u_0) s, \quad 0 \le s_i \le 1$
+$\min_s \sum_j |x_j(s) - x_j^*|^2 / L^2 + v^2 \sum_k \max(0, \epsilon - g_k(s))^2
++ w^2 \sum_i (s_i - s_{0i})^2, \quad u = u_0 + (u_1 - u_0) s, \quad 0 \le s_i \le 1$
 
-for a weight w that decreases to zero (`bounded_least_squares`). $s_0$ is the share at which an
+for a weight w that decreases to zero (`bounded_least_squares`), with the margins $g_k \ge 0$ of
+constraints. $s_0$ is the share at which an
 input is closest to zero, so the second sum selects the least effort among many solutions. The first
 start is the nearest of 512 random inputs; further starts follow if it does not reach the target.
 From a result for a target near by $s_0$ and the only start are its inputs.
@@ -29,7 +30,9 @@ from ..numerics.se3 import rotation_vector
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
 from ..typing import Pose, Scalar, cast
-from ..validation import instance, interval, is_traced, numbers, on_arm, positive, rigid
+from ..validation import instance, instances, interval, is_traced, numbers, on_arm, positive, rigid
+from .constraint import Constraint
+from .margins import margins_of, shortfall, violation
 from .progress import compiling, message_when_slow
 
 _SAMPLES, _STARTS = 512, 6
@@ -48,8 +51,10 @@ class Reach(NamedTuple):
     - `equilibrium`: the arm for these inputs.
     - `miss` [m]: distance from the target; for several points the root of the sum of squares, for a
       pose with the angle [rad] times the arm's length.
-    - `reached`: whether the miss is at most `allowed_miss`; if not, this is the nearest found.
+    - `reached`: whether the miss is at most `allowed_miss` and all constraints hold; if not, this
+      is the nearest found.
     - `allowed_miss` [m]: largest miss that counts as reached.
+    - `violation`: largest violation of a constraint, dimensionless; 0 where all hold.
     """
 
     inputs: Float[Array, " inputs"]
@@ -57,6 +62,7 @@ class Reach(NamedTuple):
     miss: Scalar
     reached: Bool[Array, ""]
     allowed_miss: Scalar
+    violation: Scalar
 
     @property
     def tip(self) -> Pose:
@@ -64,7 +70,7 @@ class Reach(NamedTuple):
         return self.equilibrium.tip
 
     def __str__(self) -> str:
-        numbers = (self.inputs, self.miss, self.reached, self.allowed_miss)
+        numbers = (self.inputs, self.miss, self.reached, self.allowed_miss, self.violation)
         if not all(eqx.is_array_like(x) and not is_traced(x) for x in numbers):
             return f"Reach(inputs={self.inputs}, miss={self.miss})"
         if self.inputs.ndim > 1:
@@ -73,13 +79,18 @@ class Reach(NamedTuple):
             return f"{reached} of {self.reached.size} targets reached, largest miss {worst:.2g} m"
         verdict = (
             "within the"
-            if bool(self.reached)
+            if bool(self.miss <= self.allowed_miss)
             else "out of reach, this is the nearest point found: more than the"
+        )
+        violated = (
+            f"\nviolation  {float(self.violation):.2g}, the constraints do not hold"
+            if bool(self.violation > 0)
+            else ""
         )
         return (
             f"inputs     {', '.join(f'{value:.6g}' for value in np.asarray(self.inputs))}\n"
             f"miss       {float(self.miss):.2g} m, {verdict} {float(self.allowed_miss):.2g} m "
-            f"allowed"
+            f"allowed{violated}"
         )
 
     __repr__ = __str__
@@ -91,6 +102,7 @@ def reach(
     bounds: Sequence[ArrayLike | Sequence],
     *,
     X: ArrayLike | Sequence | None = None,
+    constraints: Sequence[Constraint] = (),
     model: Model | None = None,
     allowed_miss: float | None = None,
     start: Reach | None = None,
@@ -107,6 +119,8 @@ def reach(
     - `bounds`: least and greatest inputs, a pair of numbers or of arrays with one number per
       actuator.
     - `X`: abscissas [m] of the points on the arm, shape (points,).
+    - `constraints`: what must hold besides, of `vsr_jax.constraint`, for example
+      `Clearance(0.002, obstacles)`.
     - `model`: as for `solve`.
     - `allowed_miss` [m]: largest miss that counts as reached; by default 1e-4 of the length, in
       single precision 1e-3. It only affects `reached`; the inputs are those of the nearest point in
@@ -122,14 +136,15 @@ def reach(
 
     **Raises:** `ValueError` for wrong shapes, a pose that is not a rigid transform, points beyond
     the arm, bounds that contradict each other or an actuator's range, a scene without actuators,
-    and a start with other actuators.
+    other constraints, and a start with other actuators.
     """
     instance("scene", scene, Scene, "a Scene")
     aim = numbers("target", target, None)
     stations = None if X is None else numbers("X", X, None).astype(aim.dtype)
     _check_target(aim, stations, scene)
     low, high = _check_bounds(scene, bounds, aim.dtype)
-    scene, model, stations = cast((scene, model, stations), aim.dtype)
+    kept = instances("constraints", constraints, Constraint, "a Constraint")
+    scene, model, stations, kept = cast((scene, model, stations, kept), aim.dtype)
     share = 1e-4 if aim.dtype == jnp.float64 else 1e-3
     allowed = (
         share * scene.rod.length
@@ -138,7 +153,7 @@ def reach(
     )
     if start is not None:
         start = lax.stop_gradient(cast(_check_start(start, low), aim.dtype))
-    problem = _ReachProblem(scene, aim, stations, low, high, model, start)
+    problem = _ReachProblem(scene, aim, stations, low, high, kept, model, start)
     with message_when_slow("vsr_jax.reach: compiling", start=False, shown=progress):
         return _reach(problem, allowed)
 
@@ -151,6 +166,7 @@ class _ReachProblem(NamedTuple):
     X: Array | None
     low: Array
     high: Array
+    constraints: tuple[Constraint, ...]
     model: Model | None
     start: Reach | None
 
@@ -185,9 +201,21 @@ class _ReachProblem(NamedTuple):
             [places[:3, 3] - self.target[:3, 3], self.scene.rod.length * rotation_vector(turn)]
         )
 
+    def seen(self, share: Array) -> tuple[Array, Array | None]:
+        """What the residual depends on, at shares of the range: places and margins."""
+        eq = self.at(share)
+        return self.places(eq), margins_of(self.constraints, eq) if self.constraints else None
+
+    def residual_of(self, places: Array, margins: Array | None) -> Array:
+        """Differences from the target relative to the arm's length, and what the margins lack."""
+        misses = self.misses(places) / self.scene.rod.length
+        if margins is None:
+            return misses
+        return jnp.concatenate([misses, shortfall(margins)])
+
     def residual(self, share: Array) -> Array:
-        """Differences from the target relative to the arm's length, at shares of the range."""
-        return self.misses(self.places(self.at(share))) / self.scene.rod.length
+        """Residual at shares of the range."""
+        return self.residual_of(*self.seen(share))
 
 
 def _check_target(target: Array, X: Array | None, scene: Scene) -> None:
@@ -241,7 +269,11 @@ def _reach(problem: _ReachProblem, allowed: Scalar) -> Reach:
     there = problem.at(share)
     miss = norm(split(problem.misses(problem.places(there))))
     miss = jnp.where(jnp.isfinite(miss), miss, jnp.inf)
-    return Reach(problem.inputs(share), there, miss, miss <= allowed, allowed)
+    violated = jnp.zeros_like(miss)
+    if problem.constraints:
+        violated = violation(margins_of(problem.constraints, there))
+    reached = (miss <= allowed) & (violated <= 0)
+    return Reach(problem.inputs(share), there, miss, reached, allowed, violated)
 
 
 def _starts(problem: _ReachProblem) -> Float[Array, "starts inputs"]:
@@ -251,10 +283,9 @@ def _starts(problem: _ReachProblem) -> Float[Array, "starts inputs"]:
         np.random.default_rng(0).uniform(size=(_SAMPLES, problem.low.size)), problem.low.dtype
     )
     tried = jnp.concatenate([problem.idle[None], tried])
-    places = jax.vmap(lambda share: problem.places(problem.at(share)))(
-        tried
-    )  # independent of the target: under vmap over targets solved once
-    distance = jax.vmap(lambda x: jnp.linalg.norm(problem.misses(x)))(places)
+    # independent of the target: under vmap over targets solved once
+    seen = jax.vmap(problem.seen)(tried)
+    distance = jax.vmap(lambda *x: jnp.linalg.norm(problem.residual_of(*x)))(*seen)
     distance, starts = jnp.where(jnp.isfinite(distance), distance, jnp.inf), []
     for _ in range(_STARTS):
         starts.append(tried[jnp.argmin(distance)])

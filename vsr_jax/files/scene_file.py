@@ -129,7 +129,7 @@ def parse_table(table: Table, path: str) -> SceneFile:
     title, inputs = table.get("title", ""), table.get("inputs")
     if not isinstance(title, str):
         raise ValueError(at(path, f"title: got {title!r}, need text"))
-    scene = _build(
+    scene = build(
         Scene, {key: value for key, value in table.items() if key not in _FILE_KEYS}, path
     )
     return SceneFile(scene, None if inputs is None else scene.check_inputs(inputs), title)
@@ -177,7 +177,7 @@ def _read(value: Any, path: str, group: Group) -> Any:
         return [_read(item, f"{path}[{i}]", group) for i, item in enumerate(value)]
     if isinstance(value, dict):
         kind = kind_of(value, path, group)
-        return _build(kind, {key: item for key, item in value.items() if key != "type"}, path)
+        return build(kind, {key: item for key, item in value.items() if key != "type"}, path)
     if group is not _PROFILES:
         raise ValueError(
             f"{path}: got {value!r}, need a table of the type {' or '.join(sorted(group))}"
@@ -198,7 +198,13 @@ def kind_of(table: Table, path: str, group: Group) -> type:
     return group[name]
 
 
-def _build(kind: type, table: Table, path: str) -> Any:
+def build(kind: type, table: Table, path: str) -> Any:
+    """The object of a class with the arguments in a table, and with the parts of a scene in the
+    tables below it.
+
+    **Raises:** `ValueError` as `construct`.
+    """
+
     def read(key: str, value: Any) -> Any:
         return _read(value, _below(path, key), _GROUPS.get(key, _PROFILES))
 

@@ -1,8 +1,8 @@
-"""Design by gradient: objectives, constraints, descent from many starts, checkpoints, design files.
+"""Design by gradient: objectives, descent from many starts, checkpoints, design files.
 
 Imports optax only when a design is set up. Does not import plotting.
 """
 
-from . import constraint, objective
+from . import objective
 
-__all__ = ["constraint", "objective"]
+__all__ = ["objective"]

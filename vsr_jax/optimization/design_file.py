@@ -31,11 +31,12 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ..analysis import constraint
+from ..analysis.constraint import Constraint
 from ..arm.scene import Scene
-from ..files.scene_file import construct, kind_of, load, parse_table
+from ..files.scene_file import build, kind_of, load, parse_table
 from ..validation import instance
-from . import constraint, objective
-from .constraint import Constraint
+from . import objective
 from .objective import Objective
 from .problem import Bounds
 from .search import Search
@@ -58,6 +59,8 @@ _CONSTRAINTS = _by_name(
     constraint.MaxTension,
     constraint.BendRadius,
     constraint.StabilityMargin,
+    constraint.Clearance,
+    constraint.MaxContactForce,
 )
 _KEYS = ("title", "scene", "inputs", "free", "uncertain", "objectives", "constraints", "search")
 
@@ -148,4 +151,4 @@ def _search(table: dict[str, Any]) -> Search:
 def _made(table: dict[str, Any], path: str, group: dict[str, type]) -> Any:
     kind = kind_of(table, path, group)
     arguments = {key: value for key, value in table.items() if key != "type"}
-    return construct(kind, arguments, path)
+    return build(kind, arguments, path)

@@ -20,13 +20,14 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 from tqdm import tqdm
 
+from ..analysis.arms import Arms
+from ..analysis.constraint import Constraint
 from ..arm.scene import Scene
 from ..arm.scene_numbers import parameters
 from ..models.base import Model
 from ..typing import Scalar
 from ..validation import instance, is_traced
 from .checkpoint import Checkpoint
-from .constraint import Constraint
 from .descent import (
     DescentState,
     DesignProblem,
@@ -36,7 +37,7 @@ from .descent import (
     descend,
     penalty_weight,
 )
-from .objective import Arms, Objective
+from .objective import Objective
 from .problem import INPUTS, Bounds, Terms, formulate
 from .search import Search
 

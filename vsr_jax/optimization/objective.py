@@ -8,40 +8,17 @@ from abc import abstractmethod
 from collections.abc import Callable, Sequence
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
+from ..analysis.arms import Arms
 from ..analysis.derivatives import compliance
-from ..arm.scene import Scene
-from ..models.base import Model, Outcome
 from ..numerics.se3 import rotation_vector
 from ..solution.equilibrium import Equilibrium
 from ..typing import Scalar
 from ..validation import concrete, instance, numbers, on_arm, positive, rigid
-
-
-class Arms(eqx.Module):
-    """A scene solved for several sets of inputs.
-
-    **Fields:** `scene`; `inputs`, shape (sets, actuators); `model`; the `outcome` of each set.
-    """
-
-    scene: Scene
-    inputs: Float[Array, "sets inputs"]
-    model: Model
-    outcome: Outcome
-
-    def each(self, function: Callable, *arrays: Array) -> PyTree:
-        """`jax.vmap` of `function` over the `Equilibrium` of each set, and over the first axis of
-        `arrays`."""
-
-        def one(inputs: Array, outcome: Outcome, *more: Array) -> PyTree:
-            return function(Equilibrium(self.scene, inputs, self.model, outcome), *more)
-
-        return jax.vmap(one)(self.inputs, self.outcome, *arrays)
 
 
 class Objective(eqx.Module):

@@ -10,16 +10,17 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from ..analysis.arms import Arms
+from ..analysis.constraint import Constraint, Inside
 from ..arm.scene import Scene
 from ..arm.scene_numbers import matching, parameters, replaced
 from ..models.base import Model
 from ..models.strain_dependent import StrainDependent
 from ..solution.solver import outcome_of
 from ..typing import Scalar, cast
-from ..validation import instance, numbers, positive
-from .constraint import Constraint, Inside
+from ..validation import instance, instances, numbers, positive
 from .descent import DesignProblem, Numbers
-from .objective import Arms, Measure, Objective
+from .objective import Measure, Objective
 
 INPUTS = "inputs"
 """Name of the inputs among the free numbers."""
@@ -87,10 +88,7 @@ def formulate(
     instance("scene", scene, Scene, "a Scene")
     sets = _sets(scene, inputs)
     minimised = objective if isinstance(objective, Objective) else Measure(_function(objective))
-    checked = tuple(
-        instance(f"constraints[{i}]", one, Constraint, "a Constraint")
-        for i, one in enumerate(constraints)
-    )
+    checked = instances("constraints", constraints, Constraint, "a Constraint")
     inside = () if any(isinstance(one, Inside) for one in checked) else (Inside(),)
     known = {name: parameter.value for name, parameter in parameters(scene).items()} | {
         INPUTS: sets

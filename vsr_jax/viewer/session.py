@@ -168,7 +168,7 @@ class Session:
             return self.answer
         low, high = (self.typed(np.array([ends[i] for ends in self.input_ranges])) for i in (0, 1))
         zero = jnp.zeros((), self._dtype)
-        near = Reach(start.inputs, start, zero, jnp.array(True), zero)
+        near = Reach(start.inputs, start, zero, jnp.array(True), zero, zero)
         with self.first("the drag of the tip"):
             found = reach(
                 start.scene,
