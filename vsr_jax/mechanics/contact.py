@@ -52,9 +52,9 @@ _RIGID = 2 / 3
 """Power of the machine epsilon that is the least compliance of a contact in the approximate
 tangent, in units of 1 / k."""
 
-_FLATNESS, _FLATTER = 0.05, 0.1
+_FLATNESS, _FLATTER = 1e-3, 0.1
 """Bound on the excess of the gap at the nearest point of a step over the least one, as a fraction
-of the outline over the square of the number of steps, and of the length b."""
+of the outline, and of the length b."""
 
 
 class Contacts(Coupling):
@@ -228,7 +228,7 @@ def contacts_of(scene: Scene, sections: CrossSections, grid: Grid) -> Contacts |
     base = jnp.asarray(base_pose(scene.rod.base, grid.h.dtype))[:3, 3]
     length = jnp.sum(grid.h)
     bending = jnp.sum(grid.weight * softest(sections.stiffness)) / length
-    flatness = _FLATNESS * scene.rod.outline(0.5 * scene.rod.length) / grid.h.shape[0] ** 2
+    flatness = _FLATNESS * scene.rod.outline(0.5 * scene.rod.length)
     return Contacts(
         scene.obstacles,
         scene.rod,

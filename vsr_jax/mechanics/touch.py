@@ -6,8 +6,12 @@ of the grid and for each obstacle the nearest point of the axis is found,
 $$\sigma = \arg\min_s \, d(r(s)) - \rho(s) + \epsilon (2 s - 1)^2, \quad 0 \le s \le 1,$$
 
 with the distance d to the obstacle and the polynomial r(s) through the step. The small $\epsilon$
-makes it unique where the arm lies along a surface, and is smaller still where it does not. The gap
-there is $g = d(r) - \rho$. Without friction the contact force is $\lambda n$ with $n = \nabla d$.
+makes it unique where the arm lies along a surface, and is negligible where it does not; the least
+value is that which contact keeps from being negative, since its derivative is that of the gap at a
+given place. Without friction the contact force is $\lambda n$ with $n = \nabla d$.
+
+As an arm slides, its contact passes from step to step. Where the nearest point of a step is its
+end, and the step beyond has a nearest point of its own, that step receives the force.
 
 The position r(s) is an integral of the axis with weights $a_j(s)$ for the nodes of the step. A
 force at s acts on node j with the share $a_j(s) / a_j(1)$, so that its work is that of the discrete
@@ -264,8 +268,11 @@ class _Step(NamedTuple):
         return self.obstacle.distance(self.place(s)) - self.rod.outline(self.X + s * self.h)
 
     def lifted(self, s: Array) -> Array:
-        """Gap with the term in epsilon."""
-        return self.gap(s) + self.flatness * (2 * s - 1) ** 2
+        """Gap with the term in epsilon, much less where the gap has a clear minimum."""
+        first, middle, last = jax.vmap(self.gap)(jnp.array([0.0, 0.5, 1.0], self.h.dtype))
+        bulge = 8 * self.flatness
+        flat = bulge / (bulge + jnp.maximum(4 * (first + last - 2 * middle), 0.0))
+        return self.gap(s) + lax.stop_gradient(self.flatness * flat**3) * (2 * s - 1) ** 2
 
     def slope(self, s: Array) -> Array:
         """Its derivative."""
