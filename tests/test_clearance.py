@@ -92,7 +92,9 @@ def test_margins_of_an_arm_that_touches():
     assert force > 0.01
     X = np.linspace(0, L, 65)
     stiffness = 3 * np.mean(8e5 * np.pi / 4 * (RADIUS + (0.007 - RADIUS) * X / L) ** 4) / L**3
-    worst = -(float(jnp.max(eq.contacts.force)) / stiffness + 0.004) / L
+    pressed = np.min(np.asarray(eq.contacts.gap) - np.asarray(eq.contacts.force) / stiffness)
+    worst = (pressed - 0.004) / L
+    assert worst < -0.1
     np.testing.assert_allclose(margins, [worst, 1 - force / 0.05], rtol=1e-6)
     margins, eq = among(BESIDE)
     free = (np.min(gap_to_ball(eq)) - 0.004) / L
@@ -130,7 +132,10 @@ def test_a_design_comes_free_of_an_obstacle():
 @pytest.mark.slow
 def test_a_design_comes_free_of_an_obstacle_that_it_touches():
     eq = vsr.solve(AMONG, INTO, model=MODEL)
-    for kept, least, most in ((Clearance(0.004), 0.004, 0.0042), (MaxContactForce(0.01), 0, 1e-5)):
+    for kept, least, most in (
+        (Clearance(0.004), 0.004, 0.0042),
+        (MaxContactForce(0.01), -1e-5, 1e-5),
+    ):
         found = vsr.design(
             AMONG,
             {"inputs": (0.0, 3.0)},

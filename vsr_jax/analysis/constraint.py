@@ -150,7 +150,7 @@ class Clearance(Constraint):
     the outline of the arm.
 
     Of the obstacles of the scene the gaps are those of `eq.contacts`, on each step. Where the arm
-    touches them g is zero however hard it presses; the contact force $\lambda$ then says how far it
+    touches them g is nearly zero however hard it presses; the contact force $\lambda$ then says how far it
     is from coming free, with the stiffness $k = 3 EI / L^3$ of the arm as a cantilever. With d = 0
     the arm may touch, but not press.
 
