@@ -150,9 +150,9 @@ class Clearance(Constraint):
     the outline of the arm.
 
     Of the obstacles of the scene the gaps are those of `eq.contacts`, on each step. Where the arm
-    touches them g is zero however hard it presses, and the contact force $\lambda$ shows the way
-    out; $k = 3 EI / L^3$ is the stiffness of the arm as a cantilever. With d = 0 the arm may touch,
-    but not press.
+    touches them g is nearly zero however hard it presses; the contact force $\lambda$ then says how
+    far it is from coming free, with the stiffness $k = 3 EI / L^3$ of the arm as a cantilever. With
+    d = 0 the arm may touch, but not press.
 
     Other `obstacles`, which the scene does not have, do not push the arm: where the constraint is
     violated the arm may be inside them. Contact is then not solved: any model will do, and the time

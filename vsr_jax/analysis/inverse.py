@@ -111,7 +111,7 @@ def reach(
     """Inputs within bounds that bring the arm to a target, with the least effort among all that do.
 
     One target at a time; batch with `jax.vmap`. Derivatives of the inputs with respect to the
-    target and the scene's numbers are implicit.
+    target and the numbers of the scene and the constraints are implicit.
 
     **Arguments:**
     - `target`: position of the tip [m], shape (3,); its pose, a rigid transform of shape (4, 4); or

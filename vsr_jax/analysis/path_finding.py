@@ -91,9 +91,9 @@ def find_path(
         )
 
     The path $u(t) = \sum_i \binom{n}{i} t^i (1 - t)^{n-i} c_i$ is a smooth Bézier curve. The search
-    starts near the straight line, then further away. Constraints hold at the samples;
-    between them the arm may come closer. A path takes seconds, or minutes where the way is narrow
-    or there are many actuators.
+    starts near the straight line, then further away. Constraints hold at the samples; between them
+    the arm may come closer. A path takes seconds, or minutes where the way is narrow, there are
+    many actuators or contact is solved.
 
     All samples are solved on their own, side by side. Where an arm has several equilibria, find out
     with `follow(scene, path.inputs)` whether it stays in these.
