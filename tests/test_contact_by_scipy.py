@@ -1,0 +1,148 @@
+"""Arms in contact against solutions found by SciPy, where nothing of the package is used: shooting
+along the elastica, and the least energy of straight pieces with hinges between them, whose joints
+must not pass a wall."""
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicSpline
+from scipy.optimize import fsolve, minimize
+
+import vsr_jax as vsr
+
+L, RADIUS, YOUNG = 0.2, 0.001, 5e7
+EI = YOUNG * np.pi * RADIUS**4 / 4
+
+
+def arm(load, obstacle):
+    rod = vsr.Rod(L, vsr.Circular(RADIUS), vsr.Material(YOUNG, poisson=0.4))
+    scene = vsr.Scene(
+        rod, (), [vsr.TipWrench(force=load)], obstacles=obstacle, free_strains=("bending_y",)
+    )
+    return vsr.solve(scene, jnp.zeros(0), model=vsr.StrainDependent(24), throw=True)
+
+
+def minimum(load, gaps, start):
+    """Joints (n, 2) in the plane of x and z, and the forces on them, where the energy is least.
+
+    `gaps` maps joints to gaps and their gradients, `start` are the angles of the pieces."""
+    h, pieces = L / len(start), len(start)
+    stiffness = np.full(pieces, EI / h)
+    stiffness[0] *= 2  # from the clamp to the middle of the first piece
+    sums = np.tri(pieces) * h
+
+    def joints(angles):
+        return np.stack([sums @ np.cos(angles), sums @ np.sin(angles)], 1)
+
+    def moved(angles):
+        """Derivatives of the joints by the angles."""
+        return -sums * np.sin(angles), sums * np.cos(angles)
+
+    def energy(angles):
+        bent = np.diff(angles, prepend=0.0)
+        end = joints(angles)[-1]
+        value = 0.5 * stiffness @ bent**2 - load @ end
+        pull = stiffness * bent
+        slope = pull - np.append(pull[1:], 0.0)
+        x, z = moved(angles)
+        return value / EI, (slope - load[0] * x[-1] - load[1] * z[-1]) / EI
+
+    def room(angles):
+        return gaps(joints(angles))[0] / L
+
+    def room_slope(angles):
+        _, gradient = gaps(joints(angles))
+        x, z = moved(angles)
+        return (gradient[:, :1] * x + gradient[:, 1:] * z) / L
+
+    found = minimize(
+        energy,
+        start,
+        jac=True,
+        method="SLSQP",
+        constraints={"type": "ineq", "fun": room, "jac": room_slope},
+        options={"maxiter": 500, "ftol": 1e-13},
+    )
+    assert found.success, found.message
+    return joints(found.x)
+
+
+def axis(eq, pieces):
+    """Positions of the joints of an equilibrium in the plane."""
+    return np.asarray(eq.position(jnp.linspace(0, L, pieces + 1)[1:]))[:, [0, 2]]
+
+
+def test_an_arm_that_leans_on_a_pillar():
+    r"""Against shooting: $EI \theta'' = F_x \sin\theta - F_z \cos\theta$ with the force F beyond
+    each section, which the contact changes; the arm touches the pillar there, and its tip is free
+    of moments."""
+    load, centre, radius = np.array([0.0, -2.0]) / L**2, np.array([0.08, -0.012]), 0.01
+
+    def piece(force, start, end, state):
+        def slope(_, y):
+            turn = force[0] * np.sin(y[0]) - force[1] * np.cos(y[0])
+            return [y[1], turn, np.cos(y[0]), np.sin(y[0])]
+
+        return solve_ivp(slope, (start, end), state, rtol=1e-11, atol=1e-13).y[:, -1]
+
+    def misses(unknown):
+        """Of curvature at the base, place, force and direction of the contact."""
+        bend, place, push, angle = unknown
+        normal = np.array([np.cos(angle), np.sin(angle)])
+        there = piece(load + push * normal, 0.0, place, [0.0, bend, 0.0, 0.0])
+        tip = piece(load, place, L, there)
+        apart = (there[2:] - centre - (radius + RADIUS) * normal) / L
+        slides = normal @ [np.cos(there[0]), np.sin(there[0])]
+        return [*apart, slides, tip[1] * L], tip[2:]
+
+    first = [5.0, 0.4 * L, 6 / L**2, np.pi / 2]
+    unknown = fsolve(lambda u: misses(u)[0], first, xtol=1e-13)
+    assert np.abs(misses(unknown)[0]).max() < 1e-10
+    pose = vsr.pose((centre[0], 0, centre[1]), pointing=(0.0, 1.0, 0.0))
+    eq = arm((0.0, 0.0, load[1] * EI), vsr.Cylinder(radius, pose=pose))
+    contacts = eq.contacts
+    at = int(contacts.force[0].argmax())
+    np.testing.assert_allclose(eq.tip[[0, 2], 3], misses(unknown)[1], atol=1e-6 * L)
+    np.testing.assert_allclose(contacts.X[0, at], unknown[1], atol=5e-6 * L)
+    np.testing.assert_allclose(contacts.force.sum(), unknown[2] * EI, rtol=1e-5)
+
+
+def test_an_arm_in_a_bent_tube():
+    width = 0.003
+    turn = np.linspace(0, 1.2, 6)
+    line = np.concatenate(
+        [
+            [[0.0, 0.0], [0.03, 0.0]],
+            np.stack([0.06 + 0.1 * np.sin(turn), 0.1 - 0.1 * np.cos(turn)], 1),
+            [[0.06 + 0.1 * np.sin(1.2) + d * np.cos(1.2), 0.1 - 0.1 * np.cos(1.2) + d * np.sin(1.2)]
+             for d in (0.04, 0.08)],
+        ]
+    )  # fmt: skip
+    along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1)))
+    middle = CubicSpline(along, line)(np.linspace(0, along[-1], 1001))
+
+    def gaps(p):
+        """From the nearest of many chords of the middle line."""
+        apart = p[:, None] - middle[:-1]
+        chords = np.diff(middle, axis=0)
+        share = np.clip(np.sum(apart * chords, 2) / np.sum(chords**2, 1), 0, 1)
+        away = apart - share[..., None] * chords
+        far = np.linalg.norm(away, axis=2)
+        at = np.argmin(far, axis=1)
+        rows = np.arange(len(p))
+        off, size = away[rows, at], far[rows, at]
+        return width - RADIUS - size, -off / np.maximum(size, 1e-12)[:, None]
+
+    tube = vsr.Tube(width, line=np.insert(line, 1, 0.0, axis=1))
+    eq = arm((0.0, 0.0, 0.0), tube)
+    # pieces along the middle line, to begin with
+    lengths = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(middle, axis=0), axis=1)))
+    ends = np.stack([np.interp(np.linspace(0, L, 101), lengths, m) for m in middle.T], 1)
+    start = np.arctan2(*np.diff(ends, axis=0).T[::-1])
+    joints = minimum(np.zeros(2), gaps, start)
+    assert int((eq.contacts.force > 0.1 * EI / L**2).sum()) >= 2
+    np.testing.assert_allclose(axis(eq, 100), joints, atol=2e-4 * L)
+    # no wall, of the spline through the same points, is passed by more than is stated
+    assert (
+        gaps(np.asarray(eq.position(jnp.linspace(0, L, 401)))[:, [0, 2]])[0].min() > -2e-3 * RADIUS
+    )
