@@ -4,6 +4,7 @@ must not pass a wall."""
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 from scipy.optimize import fsolve, minimize
@@ -107,6 +108,7 @@ def test_an_arm_that_leans_on_a_pillar():
     np.testing.assert_allclose(contacts.force.sum(), unknown[2] * EI, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_an_arm_in_a_bent_tube():
     width = 0.003
     turn = np.linspace(0, 1.2, 6)
