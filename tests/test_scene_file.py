@@ -158,7 +158,8 @@ def test_examples_converge(path):
 
 
 def test_there_are_examples():
-    assert {path.stem for path in EXAMPLES} == {"helix", "catheter", "pneumatic", "payload"}
+    stems = {path.stem for path in EXAMPLES}
+    assert stems == {"helix", "catheter", "pneumatic", "payload", "pillar", "vessel"}
 
 
 class Zigzag(vsr.Parallel):
