@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ..numerics import component as c
-from ..numerics.batching import arms_in, side_by_side
+from ..numerics.batching import TOGETHER, arms_in, side_by_side
 from ..numerics.component import Vector
 from ..numerics.damped_newton import (
     HARDENING_STAGES,
@@ -34,8 +34,11 @@ from .balance import (
     with_locked,
     without_force,
 )
-from .coupling import ArmProblem, ArmState, forces_at
+from .coupling import ArmProblem, ArmState, clear_of, forces_at
 from .sizes import shape_of, shape_size
+
+_FEW = 16
+"""Arms with constraints that are solved together: some need four times as many steps as most."""
 
 _START_STEPS = 4
 """Fixed-point steps to the start: each gains a factor of the strains that threads cause."""
@@ -52,7 +55,8 @@ def solve_arm(problem: ArmProblem, free: tuple[int, ...], guess: ArmUnknown | No
     def find(problem: ArmProblem, guess: ArmUnknown | None) -> Root:
         if guess is not None:  # the iteration does not change the locked strains
             guess = guess._replace(xi=with_locked(guess.xi, problem.sections, free))
-        root = side_by_side(partial(_solve, free))(_start(problem, free), guess, problem)
+        together = _FEW if problem.softens else TOGETHER
+        root = side_by_side(partial(_solve, free), together)(_start(problem, free), guess, problem)
         return root._replace(x=root.x._replace(xi=free_components(root.x.xi, free)))
 
     def whole(x: ArmUnknown, problem: ArmProblem) -> ArmUnknown:
@@ -215,7 +219,8 @@ def _solve(
         cut = jnp.minimum(1.0, MAX_TURN / jnp.maximum(sizes.turn(step), MAX_TURN))
         step = jax.tree.map(lambda x: cut.astype(x.dtype) * x, step)
         merit = sizes.of_imbalance(imbalance, at)
-        return Damped(step, size, c.single(imbalance.wrench), merit, definite, doubtful)
+        clear = clear_of(at, problem)
+        return Damped(step, size, c.single(imbalance.wrench), merit, definite, doubtful, clear)
 
     shares = 1 if whole.loads is None else LOAD_INCREMENTS
     floor = jnp.broadcast_to(rounding_of(whole), arms)

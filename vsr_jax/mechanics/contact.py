@@ -52,6 +52,10 @@ _RIGID = 2 / 3
 """Power of the machine epsilon that is the least compliance of a contact in the approximate
 tangent, in units of 1 / k."""
 
+_CLEAR = 0.3
+"""Deflection by all contact forces, as a fraction of the least gap, below which nothing is
+touched."""
+
 _FLATNESS, _FLATTER = 1e-3, 0.1
 """Bound on the excess of the gap at the nearest point of a step over the least one, as a fraction
 of the outline, and of the length b."""
@@ -173,6 +177,11 @@ class Contacts(Coupling):
         world = jnp.concatenate([jnp.zeros_like(force), force])
         world = jnp.moveaxis(world, (2, 3), (0, 1)).reshape(-1, *world.shape[:2], self.steps)
         return of_forces(world, at.along, grid)
+
+    def clear(self, at: ArmState, note: Touch, problem: ArmProblem) -> Array:
+        """Whether all forces together bend the arm by much less than the least gap."""
+        bent = jnp.sum(note.force, axis=(0, 1)) / self.scale
+        return bent < _CLEAR * jnp.min(note.gap, axis=(0, 1))
 
     def moved(self, x: Array, X: Array, grid: Grid) -> Array:
         """The forces on the steps in which the middles of the old ones lie."""

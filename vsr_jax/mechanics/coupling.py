@@ -271,6 +271,11 @@ class Coupling(eqx.Module):
         """Its part of the tangent system, in place of a border; none by default."""
         return None
 
+    def clear(self, at: ArmState, note: Any, problem: ArmProblem) -> Array | bool:
+        """Whether the arm satisfies a constraint that `softens` by a wide margin, so that the exact
+        one has no effect; never by default."""
+        return False
+
     def from_rate(self, xi: Vector, rate: Vector, sections: CrossSections) -> PyTree:
         r"""Its unknowns, where it `follows_rate`, from the strain and the derivative $(\xi -
         \xi^*)'$ along the arm, which models with a basis know."""
@@ -299,6 +304,16 @@ def loads_with(
     for coupling, x in zip(couplings, unknowns, strict=True):
         loads = coupling.loads(x, loads)
     return loads
+
+
+def clear_of(at: ArmState, problem: ArmProblem) -> Array | None:
+    """Whether the arm satisfies all its constraints by a wide margin; None if it has none."""
+    each = [
+        coupling.clear(at, note, problem)
+        for coupling, note in zip(problem.couplings, at.notes, strict=True)
+        if coupling.softens
+    ]
+    return jnp.all(jnp.stack(jnp.broadcast_arrays(*each)), axis=0) if each else None
 
 
 def borders_of(

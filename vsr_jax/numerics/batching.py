@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 from jax.custom_batching import custom_vmap
 
-_TOGETHER = 136
+TOGETHER = 136
 """Arms that are solved together, at most: the arrays of one pass then stay in the cache."""
 
 _ALIASED = 64
@@ -18,7 +18,7 @@ _ALIASED = 64
 same few cache lines."""
 
 
-def side_by_side(solve: Callable) -> Callable:
+def side_by_side(solve: Callable, together: int = TOGETHER) -> Callable:
     """`solve` with a rule for `jax.vmap` that puts the batch into the last axis of every array.
 
     With the batch in the first axis, every array is transposed before and after each pass along the
@@ -27,7 +27,8 @@ def side_by_side(solve: Callable) -> Callable:
     length is a power of two.
 
     **Arguments:** `solve`: takes pytrees of arrays and returns one. For a batch each array has one
-    more axis at its end, of size 1 where it is the same for all arms.
+    more axis at its end, of size 1 where it is the same for all arms. `together`: size of a part,
+    at most.
     """
 
     @custom_vmap
@@ -36,28 +37,28 @@ def side_by_side(solve: Callable) -> Callable:
 
     @batched_solve.def_vmap
     def _(size: int, batched: list, *arguments: Any) -> tuple[Any, Any]:
-        parts = -(-size // _TOGETHER) or 1
-        together = -(-size // parts) or 1
-        together += 8 if together % _ALIASED == 0 else 0
-        place = jnp.minimum(jnp.arange(parts * together), max(size - 1, 0))
+        parts = -(-size // together) or 1
+        arms = -(-size // parts) or 1
+        arms += 8 if arms % _ALIASED == 0 else 0
+        place = jnp.minimum(jnp.arange(parts * arms), max(size - 1, 0))
         leaves, tree = jax.tree.flatten(arguments)
         own = jax.tree.leaves(batched)
 
         def part(x: Any) -> Any:
             x = x if size else jnp.zeros((1, *x.shape[1:]), x.dtype)
             x = jnp.moveaxis(x[place], 0, -1)
-            return jnp.moveaxis(x.reshape(*x.shape[:-1], parts, together), -2, 0)
+            return jnp.moveaxis(x.reshape(*x.shape[:-1], parts, arms), -2, 0)
 
         def solved(varying: list) -> Any:
             given = iter(varying)
             every = [next(given) if o else x[..., None] for x, o in zip(leaves, own, strict=True)]
             result = solve(*jax.tree.unflatten(tree, every))
-            return jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], together)), result)
+            return jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], arms)), result)
 
         varying = [part(x) for x, o in zip(leaves, own, strict=True) if o]
         result = lax.map(solved, varying)
         result = jax.tree.map(
-            lambda x: jnp.moveaxis(x, -1, 1).reshape(parts * together, *x.shape[1:-1])[:size],
+            lambda x: jnp.moveaxis(x, -1, 1).reshape(parts * arms, *x.shape[1:-1])[:size],
             result,
         )
         return result, jax.tree.map(lambda _: True, result)

@@ -57,8 +57,9 @@ in each."""
 
 class Damped(NamedTuple):
     """Evaluation of one point and one damping for `damped_newton`: the step to subtract, its size,
-    the residual, its size, whether the damped tangent is positive definite, and whether that is
-    doubtful, since it is far from symmetric."""
+    the residual, its size, whether the damped tangent is positive definite, whether that is
+    doubtful, since it is far from symmetric, and, with constraints, whether they hold by a wide
+    margin."""
 
     step: Any
     size: Array
@@ -66,6 +67,7 @@ class Damped(NamedTuple):
     merit: Array
     definite: Array
     doubtful: Array
+    clear: Array | None = None
 
 
 class Measures(NamedTuple):
@@ -86,7 +88,7 @@ class _Guard(NamedTuple):
     the number of evaluations and of plain Newton steps; the number of undamped steps in a row under
     the same loads, by what factor the last of them became smaller, and their rate where they shrink
     linearly; whether the solution is to be probed, the number of probes, and the growth of the
-    motion in them."""
+    motion in them; whether the constraints hold by a wide margin."""
 
     size: Array
     miss: Array
@@ -106,6 +108,7 @@ class _Guard(NamedTuple):
     doubtful: Array
     probes: Array
     growth: Array
+    clear: Array
 
 
 def damped_newton(
@@ -137,7 +140,8 @@ def damped_newton(
     - Acceleration, with `measures.dot`. Near the solution, steps that shrink linearly, as with
       friction, and not quadratically are replaced by those of `accelerated`.
     - Stages. The stages of constraints without an energy accept every finite step, undamped; one
-      that goes back by half of the last one is halved.
+      that goes back by half of the last one is halved. Where the constraints hold by a wide margin,
+      the last stage follows at once.
     - Probing. Where the tangent is doubtful at the end, the arm is moved from the solution by the
       last step, made small, and creeps: $s_{n+1} = s_n + (H + \mu \Sigma)^{-1} r(x - s_n)$. The
       solution is unstable if the motion grows after some steps.
@@ -201,7 +205,8 @@ def damped_newton(
         more = jnp.where(probe, 1.0, jnp.where(hard, 0.0, more))
         new_step = jax.tree.map(lambda s, last: s + more.astype(s.dtype) * last, new.step, step)
         if stages and measures.dot is not None:
-            back = hard & (measures.dot(new_step, step) < -0.5 * measures.dot(step, step))
+            same = hard & (old.applied == applied)
+            back = same & (measures.dot(new_step, step) < -0.5 * measures.dot(step, step))
             half = jnp.where(back, 0.5, 1.0)
             new_step = jax.tree.map(lambda s: half.astype(s.dtype) * s, new_step)
         if measures.dot is not None:
@@ -267,6 +272,7 @@ def _careful(floor: Array, increments: int) -> _Guard:
         doubtful=no,
         probes=none,
         growth=zero + 1,
+        clear=no,
     )
 
 
@@ -294,7 +300,8 @@ def _attempt(old: _Guard, plain: Array, increments: int, levels: int) -> tuple[A
     more = jnp.where(old.fresh, jnp.minimum(old.applied + 1, increments), old.applied)
     if levels > increments:
         settled = old.fresh & (old.damping == 0) & (old.size < _SETTLED)
-        further = jnp.minimum(old.applied + settled, levels)
+        further = jnp.where(old.clear, levels, jnp.minimum(old.applied + 1, levels))
+        further = jnp.where(settled, further, old.applied)
         more = jnp.where(old.applied >= increments, further, more)
     return jnp.where(plain, 0.0, damping), jnp.where(plain, levels, more)
 
@@ -364,6 +371,7 @@ def _judged(
         whole=jnp.where(whole, old.whole + 1, 0),
         contraction=jnp.where(whole, ratio, jnp.inf),
         doubtful=new.doubtful,
+        clear=old.clear if new.clear is None else new.clear,
     )
     here = old._replace(damping=damping, fresh=plain)
     guard = select(taken, there, here)
