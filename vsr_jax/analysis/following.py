@@ -9,6 +9,10 @@ $$T_j(X) = \min(\max(T_{j-1}(X), T_j e^{-\mu \varphi(X)}), T_j e^{\mu \varphi(X)
 with $T_j$ the tension at the start and $\varphi$ the turning angle of the path: where the old
 tension lies between both envelopes the cable sticks, elsewhere it slips.
 
+Contacts with obstacles that have friction remember the shape of the arm. The point of its surface
+that is in contact either has not moved along the obstacle since the sample before, with a friction
+force of at most $\mu \lambda$, or it slips, and $\mu \lambda$ opposes its motion.
+
 **Source:** for a cable in a sheath of fixed shape, M. Kaneko, T. Yamashita and K. Tanie, Basic
 considerations on transmission characteristics for tendon drive robots, ICAR 1991.
 """
@@ -38,13 +42,20 @@ def follow(
     model: StrainDependent | None = None,
     start: Equilibrium | None = None,
 ) -> Equilibrium:
-    r"""Equilibria along a path of inputs, in order, with the history of the tendons' friction.
+    r"""Equilibria along a path of inputs, in order, with the history of friction, of tendons and of
+    contact with obstacles.
 
     Where a tendon has friction its tension follows $T_j(X) = \min(\max(T_{j-1}(X), T_j e^{-\mu
     \varphi(X)}), T_j e^{\mu \varphi(X)})$ from one sample to the next: after a reversal it slips
     from its start on, and sticks beyond with the tension that it had. The `motion` of the tendons
     is not used; pulling from rest follows the law of `"pull"`, releasing far enough that of
     `"release"`. A part that sticks keeps its tension also where loads deform the arm there.
+
+    Where the arm touches an obstacle with friction $\mu$, the friction force f along the surface
+    and the motion $\Delta$ of the touching point since the last sample obey Coulomb's law:
+    $\Delta = 0$ and $|f| \le \mu \lambda$ (it sticks), or $f = -\mu \lambda \Delta / |\Delta|$
+    (it slips). Samples should be close where the direction of slip changes. The forces are in
+    `Equilibrium.contacts`.
 
     Without friction the equilibria are those of `solve(start=)`: of several stable ones the arm
     stays in the one that it is in.

@@ -26,9 +26,14 @@ from .functions import Position, function_of_position
 
 
 class Obstacle(Part):
-    """A rigid obstacle fixed in the world. One that `encloses` the arm is a lumen: the arm must
-    start inside it, and elsewhere may be beyond its wall at rest."""
+    r"""A rigid obstacle fixed in the world. One that `encloses` the arm is a lumen: the arm must
+    start inside it, and elsewhere may be beyond its wall at rest.
 
+    `friction` is the coefficient $\mu$ [-] of Coulomb friction between arm and obstacle, None
+    without. It acts along a path of inputs: see `vsr_jax.follow`.
+    """
+
+    friction: Scalar | None = eqx.field(default=None, kw_only=True, metadata={"unit": "-"})
     effect: eqx.AbstractClassVar[str]
     encloses: ClassVar[bool] = False
 
@@ -69,6 +74,11 @@ def local_point(pose: Pose | None, point: Position) -> Position:
     return point if pose is None else matvec(transpose(pose[:3, :3]), point - pose[:3, 3])
 
 
+def coefficient(name: str, friction: ArrayLike | None) -> Scalar | None:
+    """A coefficient of friction; None without."""
+    return None if friction is None else numbers(f"{name}.friction", friction, least=0.0)
+
+
 def _pose(name: str, pose: MatrixLike | None) -> Pose | None:
     return None if pose is None else rigid(name, pose)
 
@@ -89,13 +99,21 @@ class Plane(Obstacle):
     **Arguments:**
     - `normal`: a vector of any length that points to the side where the arm may be.
     - `point`: $p$ [m], a point of the plane, the origin by default.
+    - `friction`: coefficient $\mu$ [-], none by default.
     """
 
     normal: Float[Array, "3"] = eqx.field(metadata={"unit": "-"})
     point: Position = eqx.field(metadata={"unit": "m"})
     effect = "plane"
 
-    def __init__(self, normal: VectorLike, point: VectorLike = (0.0, 0.0, 0.0)):
+    def __init__(
+        self,
+        normal: VectorLike,
+        point: VectorLike = (0.0, 0.0, 0.0),
+        *,
+        friction: ArrayLike | None = None,
+    ):
+        self.friction = coefficient("Plane", friction)
         self.normal = numbers("Plane.normal", normal, (3,))
         self.point = numbers("Plane.point", point, (3,))
         known = concrete(self.normal)
@@ -113,14 +131,16 @@ class Plane(Obstacle):
 class Sphere(Obstacle):
     r"""A ball, $d = |r - c| - R$.
 
-    **Arguments:** `centre`: $c$ [m], shape (3,); `radius`: $R$ [m].
+    **Arguments:** `centre`: $c$ [m], shape (3,); `radius`: $R$ [m]; `friction`: coefficient $\mu$
+    [-], none by default.
     """
 
     centre: Position = eqx.field(metadata={"unit": "m"})
     radius: Scalar = eqx.field(metadata={"unit": "m"})
     effect = "sphere"
 
-    def __init__(self, centre: VectorLike, radius: ArrayLike):
+    def __init__(self, centre: VectorLike, radius: ArrayLike, *, friction: ArrayLike | None = None):
+        self.friction = coefficient("Sphere", friction)
         self.centre = numbers("Sphere.centre", centre, (3,))
         self.radius = numbers("Sphere.radius", radius, positive=True)
 
@@ -133,12 +153,13 @@ class Sphere(Obstacle):
 
 
 class Cylinder(Obstacle):
-    """A solid cylinder about the x axis of its pose.
+    r"""A solid cylinder about the x axis of its pose.
 
     **Arguments:**
     - `radius`: [m].
     - `length`: [m], half of it on each side of the pose's origin; endless by default.
     - `pose`: of shape (4, 4), as from `vsr_jax.pose`; the identity by default.
+    - `friction`: coefficient $\mu$ [-], none by default.
     """
 
     radius: Scalar = eqx.field(metadata={"unit": "m"})
@@ -152,7 +173,9 @@ class Cylinder(Obstacle):
         *,
         length: ArrayLike | None = None,
         pose: MatrixLike | None = None,
+        friction: ArrayLike | None = None,
     ):
+        self.friction = coefficient("Cylinder", friction)
         self.radius = numbers("Cylinder.radius", radius, positive=True)
         self.length = None if length is None else numbers("Cylinder.length", length, positive=True)
         self.pose = _pose("Cylinder.pose", pose)
@@ -170,12 +193,13 @@ class Cylinder(Obstacle):
 
 
 class Box(Obstacle):
-    """A cuboid whose centre and axes are those of its pose.
+    r"""A cuboid whose centre and axes are those of its pose.
 
     **Arguments:**
     - `size`: its three sides [m], along x, y and z of the pose.
     - `pose`: of shape (4, 4), as from `vsr_jax.pose`; the identity by default.
     - `rounding`: radius of its edges and corners [m], within `size`; sharp by default.
+    - `friction`: coefficient $\mu$ [-], none by default.
     """
 
     size: Float[Array, "3"] = eqx.field(metadata={"unit": "m"})
@@ -189,7 +213,9 @@ class Box(Obstacle):
         *,
         pose: MatrixLike | None = None,
         rounding: ArrayLike = 0.0,
+        friction: ArrayLike | None = None,
     ):
+        self.friction = coefficient("Box", friction)
         self.size = numbers("Box.size", size, (3,), positive=True)
         self.pose = _pose("Box.pose", pose)
         known = concrete(self.size)
@@ -206,12 +232,14 @@ class Box(Obstacle):
 
 
 class Field(Obstacle):
-    """An obstacle of any shape, given by a signed distance.
+    r"""An obstacle of any shape, given by a signed distance.
 
-    **Arguments:** `function`: of a position [m], shape (3,), that returns the distance [m], written
-    with `jax.numpy` and twice differentiable near the surface. The numbers of an equinox module are
-    differentiable. A function that is not a distance, such as the value of a level set, must be
-    divided by the length of its gradient.
+    **Arguments:**
+    - `function`: of a position [m], shape (3,), that returns the distance [m], written with
+      `jax.numpy` and twice differentiable near the surface. The numbers of an equinox module are
+      differentiable. A function that is not a distance, such as the value of a level set, must be
+      divided by the length of its gradient.
+    - `friction`: coefficient $\mu$ [-], none by default.
 
     **Raises:** `ValueError` for a function that does not return one number.
     """
@@ -219,7 +247,10 @@ class Field(Obstacle):
     function: Callable
     effect = "distance field"
 
-    def __init__(self, function: Callable[[Position], ArrayLike]):
+    def __init__(
+        self, function: Callable[[Position], ArrayLike], *, friction: ArrayLike | None = None
+    ):
+        self.friction = coefficient("Field", friction)
         if not callable(function):
             raise ValueError(f"Field.function: got {function!r}, need a function of the position")
         self.function = function_of_position(function)

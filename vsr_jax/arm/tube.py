@@ -10,10 +10,10 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ..numerics.component import norm, split
-from ..typing import MatrixLike, Pose, Scalar
+from ..typing import ArrayLike, MatrixLike, Pose, Scalar
 from ..validation import concrete, numbers, rigid
 from .functions import Position
-from .obstacles import Obstacle, local_point
+from .obstacles import Obstacle, coefficient, local_point
 from .profile import Constant, Profile, ProfileLike, as_profile
 from .spline import spline_slopes
 
@@ -39,6 +39,7 @@ class Tube(Obstacle):
       are a straight line, more a cubic not-a-knot spline over the abscissa, which is the sum of the
       distances between the points. By default the x axis, endless.
     - `pose`: of shape (4, 4), as from `vsr_jax.pose`; the identity by default.
+    - `friction`: coefficient $\mu$ [-], none by default.
 
     **Raises:** `ValueError` for fewer than two points, for consecutive points that coincide, and
     for a profile without a line.
@@ -56,7 +57,9 @@ class Tube(Obstacle):
         line: MatrixLike | None = None,
         *,
         pose: MatrixLike | None = None,
+        friction: ArrayLike | None = None,
     ):
+        self.friction = coefficient("Tube", friction)
         self.radius = as_profile("Tube.radius", radius, positive=True)
         self.line = None if line is None else _points("Tube.line", line)
         self.pose = None if pose is None else rigid("Tube.pose", pose)

@@ -213,6 +213,9 @@ def _solve(
         at = state_of(unknown.xi, unknown.coupled, problem)
         imbalance = imbalance_of(unknown, at, problem, free)
         step, definite, doubtful = approximate_solve(unknown, at, imbalance, problem, free, damping)
+        slides = problem.dissipates
+        if slides is not None:  # no pivot tells then
+            definite, doubtful = definite | slides, doubtful & ~slides
         step = _followed(step, unknown, imbalance, problem, free)
         size = sizes.of_step(step, at)
         # A step that coils the arm may lower the residual without approaching a solution.
@@ -220,7 +223,8 @@ def _solve(
         step = jax.tree.map(lambda x: cut.astype(x.dtype) * x, step)
         merit = sizes.of_imbalance(imbalance, at)
         clear = clear_of(at, problem)
-        return Damped(step, size, c.single(imbalance.wrench), merit, definite, doubtful, clear)
+        wrench = c.single(imbalance.wrench)
+        return Damped(step, size, wrench, merit, definite, doubtful, clear, slides)
 
     shares = 1 if whole.loads is None else LOAD_INCREMENTS
     floor = jnp.broadcast_to(rounding_of(whole), arms)
@@ -228,7 +232,7 @@ def _solve(
     measures = Measures(
         sizes.work, sizes.turn, sizes.dot if whole.follows_rate or whole.softens else None
     )
-    return damped_newton(
+    root = damped_newton(
         evaluate,
         measures,
         start,
@@ -237,3 +241,9 @@ def _solve(
         again,
         stages=HARDENING_STAGES if whole.softens else 0,
     )
+    if whole.dissipates is None:
+        return root
+    at = state_of(root.x.xi, root.x.coupled, whole)
+    imbalance = imbalance_of(root.x, at, whole, free)
+    _, definite, _ = approximate_solve(root.x, at, imbalance, whole, free, symmetric=True)
+    return root._replace(definite=definite)

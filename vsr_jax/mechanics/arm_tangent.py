@@ -40,10 +40,12 @@ def approximate_solve(
     problem: ArmProblem,
     free: tuple[int, ...],
     damping: Array | float = 0.0,
+    *,
+    symmetric: bool = False,
 ) -> tuple[ArmUnknown, Array, Array]:
     """Approximate solution of the tangent system (see `elimination`; a coupling without a border
     has the tangent 1), whether it is definite for the changes of shape that the couplings allow,
-    and whether that is doubtful.
+    and whether that is doubtful; `symmetric`: with the contact forces that friction follows held.
 
     In single precision: the passes along the arm are bound by memory, and rounding is far below the
     error of the elimination. Two keep the precision of the unknowns: straight tendons of an arm
@@ -70,6 +72,8 @@ def approximate_solve(
             slopes = slopes._replace(ends=pull.cut_slopes(slopes.motion), joined=pull.joined)
 
     points = points_of(problem, unknown.coupled, at)
+    if symmetric:
+        points = {place: one._replace(wrench=one.direction) for place, one in points.items()}
     pushes = [one.pushes(right.coupled[place]) for place, one in points.items()]
     if slopes is not None and slopes.cells is not None:
         slopes = slopes._replace(cells=slopes.cells + sum(one.slopes() for one in points.values()))

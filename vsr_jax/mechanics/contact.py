@@ -1,4 +1,4 @@
-r"""Contact without friction between an arm and obstacles.
+r"""Contact between an arm and obstacles.
 
 The unknowns are the contact forces $\lambda$ [N], one per obstacle and step of the grid, where the
 gap g to the obstacle is least (see `touch`). The rows are the complementarity of force and gap,
@@ -17,15 +17,16 @@ contacts in the elimination along the arm (`PointForces`).
 On the way to a solution that this does not find at once, b is 0.1 of the arm and c is 0.01 while
 the loads grow. The force is then given by the gap, $\lambda = \tfrac{k}{2 c} (\sqrt{g^2 + 4 c b^2}
 - g)$, so that the balance is the gradient of an energy, which shows whether a step is an advance.
-After that both become smaller together.
+After that both become smaller together. Friction (see `slip`) comes last.
 """
 
 from dataclasses import replace
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, PyTree
 
 from ..arm.obstacles import Obstacle
 from ..arm.rod import Rod
@@ -33,12 +34,13 @@ from ..arm.scene import CrossSections, Scene
 from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import Grid, locate
 from ..numerics.se3 import base_pose, stacked_rotation
-from ..numerics.stacked import cross
+from ..typing import DTypeLike
 from .coupling import SOFTENED, ArmProblem, ArmState, Coupling, PointForces
 from .held import of_forces
 from .pose_terms import finite
 from .reaction import Loading
 from .sizes import softest
+from .slip import Rough, Traces, moved_to
 from .touch import Surroundings, Touch
 
 _FIRST, _LAST = (0.1, 1e-2), (1e-9, 1e-10)
@@ -52,6 +54,9 @@ _RIGID = 2 / 3
 """Power of the machine epsilon that is the least compliance of a contact in the approximate
 tangent, in units of 1 / k."""
 
+_NO_FRICTION = 1e-9
+"""Friction that counts as none, in units of k and the arm's length."""
+
 _CLEAR = 0.3
 """Deflection by all contact forces, as a fraction of the least gap, below which nothing is
 touched."""
@@ -62,12 +67,14 @@ of the outline, and of the length b."""
 
 
 class Contacts(Coupling):
-    """All contacts of an arm; the unknowns are their forces [N], shape (obstacles * steps, ...).
+    """All contacts of an arm; the unknowns are their forces [N], shape (obstacles * steps, ...),
+    and with friction a pair, the second (3, obstacles * steps, ...) the friction [N] in the world.
 
     **Fields:** the `obstacles`, the `rod` and the position of its `base`; the stiffness k, `scale`;
     `flatness` and `lift` of `Surroundings`; the length b, `blur`, and the compliance c, `give`, and
-    both while the loads grow, `first`; the number of `steps`; `soft`: 1 where the gaps give the
-    forces.
+    both while the loads grow, `first`; the number of `steps`; the coefficients of `friction`, None
+    without; `soft`: 1 where the gaps give the forces; `traces`: what the contacts remember where
+    the arm follows a path of inputs, None without.
     """
 
     obstacles: tuple[Obstacle, ...]
@@ -80,7 +87,9 @@ class Contacts(Coupling):
     give: Array
     first: Array
     steps: int = eqx.field(static=True)
+    friction: Array | None = None
     soft: Array | None = None
+    traces: Traces | None = None
     softens = True
 
     def relaxed(self) -> "Contacts":
@@ -99,6 +108,7 @@ class Contacts(Coupling):
             blur=(blur * length).astype(of),
             give=give.astype(of),
             flatness=jnp.maximum(self.flatness, _FLATTER * blur * length).astype(of),
+            friction=None if self.friction is None else (hardness >= 1) * self.friction,
         )
 
     def start(self, xi: Vector, problem: ArmProblem) -> Vector:
@@ -114,13 +124,17 @@ class Contacts(Coupling):
         return xi
 
     def like(self, other: Coupling) -> bool:
-        return isinstance(other, Contacts) and len(self.obstacles) == len(other.obstacles)
+        return (
+            isinstance(other, Contacts)
+            and len(self.obstacles) == len(other.obstacles)
+            and (self.friction is None) == (other.friction is None)
+        )
 
-    def guess(self, forces: Forces, grid: Grid) -> Float[Array, "contacts ..."]:
-        size = len(self.obstacles) * self.steps
-        return jnp.zeros((size, *grid.h.shape[1:]), grid.h.dtype)
+    def guess(self, forces: Forces, grid: Grid) -> PyTree:
+        force = jnp.zeros((len(self.obstacles) * self.steps, *grid.h.shape[1:]), grid.h.dtype)
+        return force if self.friction is None else (force, jnp.stack([force] * 3))
 
-    def loads(self, x: Array, loads: Loading | None) -> Loading | None:
+    def loads(self, x: PyTree, loads: Loading | None) -> Loading | None:
         assert loads is not None
         around = Surroundings(
             self.obstacles,
@@ -130,41 +144,75 @@ class Contacts(Coupling):
             self.lift,
             self.scale / self.give,
             2 * jnp.sqrt(self.give) * self.blur,
-            x,
+            self._forces(x),
             self.soft,
+            self._rough(x),
         )
         return loads._replace(around=around)
 
-    def note(self, x: Array, at: ArmState, problem: ArmProblem) -> Touch:
+    def _forces(self, x: PyTree) -> Array:
+        """The contact forces."""
+        return x if self.friction is None else x[0]
+
+    def _rough(self, x: PyTree) -> Rough | None:
+        """Friction."""
+        if self.friction is None or self.traces is None:
+            return None
+        least = _NO_FRICTION * self.scale * self.rod.length
+        return Rough(self.friction, self.scale, least, x[1], self.traces)
+
+    def dissipates(self) -> Array | None:
+        if self.friction is None or self.traces is None:
+            return None
+        return jnp.any(self.friction > 0, axis=0)
+
+    def after(self, x: PyTree, at: ArmState, problem: ArmProblem) -> "Contacts":
+        if self.friction is None:
+            return self
+        assert at.along is not None
+        return replace(self, traces=Traces(self.base, at.along.axis, at.along.rotation))
+
+    def remembering(self, other: Coupling, X: Array, grid: Grid) -> "Contacts":
+        assert isinstance(other, Contacts)
+        if other.traces is None:
+            return self
+        return replace(self, traces=moved_to(other.traces, X, grid))
+
+    def note(self, x: PyTree, at: ArmState, problem: ArmProblem) -> Touch:
         """The contacts."""
         assert at.along is not None
         assert at.along.touch is not None
         return at.along.touch
 
     def residual(
-        self, x: Array, at: ArmState, note: Touch, problem: ArmProblem, free: tuple[int, ...]
-    ) -> Array:
-        force, own = note.force, x.reshape(note.force.shape)
+        self, x: PyTree, at: ArmState, note: Touch, problem: ArmProblem, free: tuple[int, ...]
+    ) -> PyTree:
+        force, own = note.force, self._forces(x).reshape(note.force.shape)
         pushed = self.scale * note.raised + self.give * force
         rows = 0.5 * (force + pushed - self._root(force - pushed))
         rows = jnp.where(note.handed != 0, own, rows)
         if self.soft is not None:
             rows = jnp.where(self.soft > 0, own - force, rows)
-        return rows.reshape(x.shape)
+        rows = rows.reshape(self._forces(x).shape)
+        if self.friction is None:
+            return rows
+        return rows, x[1] if note.slip is None else note.slip.row.reshape(x[1].shape)
 
-    def points(self, x: Array, at: ArmState, note: Touch, problem: ArmProblem) -> PointForces:
+    def points(self, x: PyTree, at: ArmState, note: Touch, problem: ArmProblem) -> PointForces:
         apart = (1 - self.give) * note.force - self.scale * note.raised
         free = 1 - jnp.abs(note.handed)
         free = free if self.soft is None else (1 - self.soft) * free
         pushing = 0.5 * free * (1 + apart / self._root(apart))
-        least = jnp.finfo(x.dtype).eps ** _RIGID
-        return PointForces(
-            free * jnp.concatenate([cross(note.lever, note.normal), note.normal]),
+        least = float(jnp.finfo(free.dtype).eps) ** _RIGID
+        normal = PointForces(
+            free * note.per_force,
+            free * note.direction,
             note.cell,
             pushing * self.scale,
             jnp.maximum(1 - (1 - self.give) * pushing, least),
             note.handed,
         )
+        return normal if note.slip is None else _with_slip(normal, note, self.scale, least)
 
     def rows(self, at: ArmState, note: Touch, grid: Grid) -> Vector:
         """For each contact of one arm the wrenches at the nodes whose work over a change of strain
@@ -183,32 +231,56 @@ class Contacts(Coupling):
         bent = jnp.sum(note.force, axis=(0, 1)) / self.scale
         return bent < _CLEAR * jnp.min(note.gap, axis=(0, 1))
 
-    def moved(self, x: Array, X: Array, grid: Grid) -> Array:
+    def moved(self, x: PyTree, X: Array, grid: Grid) -> PyTree:
         """The forces on the steps in which the middles of the old ones lie."""
         if X.shape[1] == self.steps:
             return x
         step, _ = locate(grid, jnp.mean(X, axis=0))
-        force = x.reshape(len(self.obstacles), -1)
-        return jnp.zeros((len(force), self.steps), x.dtype).at[:, step].add(force).reshape(-1)
+
+        def gathered(force: Array) -> Array:
+            force = force.reshape(*force.shape[:-1], len(self.obstacles), -1)
+            found = jnp.zeros((*force.shape[:-1], self.steps), force.dtype)
+            found = found.at[..., step].add(force)
+            return found.reshape(*force.shape[:-2], -1)
+
+        return jax.tree.map(gathered, x)
 
     def _root(self, apart: Array) -> Array:
         """A smooth absolute value of the difference of force and scaled gap."""
         return jnp.sqrt(apart**2 + (2 * self.scale * self.blur) ** 2)
 
-    def sizes(self, x: Array, at: ArmState, problem: ArmProblem) -> list[Array]:
-        return [x / (self.scale * problem.length)]
+    def sizes(self, x: PyTree, at: ArmState, problem: ArmProblem) -> list[Array]:
+        return [force / (self.scale * problem.length) for force in jax.tree.leaves(x)]
 
-    def row_sizes(self, rows: Array, at: ArmState, problem: ArmProblem) -> list[Array]:
+    def row_sizes(self, rows: PyTree, at: ArmState, problem: ArmProblem) -> list[Array]:
         """Gaps and deflections by forces, per length of the arm."""
         return self.sizes(rows, at, problem)
 
-    def units(self, problem: ArmProblem) -> tuple[Array, Array]:
+    def units(self, problem: ArmProblem) -> tuple[PyTree, PyTree]:
         root = jnp.sqrt(self.scale)
-        return 1 / root, root
+        row, change = 1 / root, root
+        return (row, change) if self.friction is None else ((row, row), (change, change))
 
-    def radians(self, problem: ArmProblem) -> Array:
-        size = len(self.obstacles) * self.steps
-        return jnp.broadcast_to(1 / (self.scale * problem.length), (size,))
+    def radians(self, problem: ArmProblem) -> PyTree:
+        like = self.guess((), problem.grid)
+        return jax.tree.map(lambda x: x + 1 / (self.scale * problem.length), like)
+
+
+def _with_slip(normal: PointForces, touch: Touch, scale: Array, least: float) -> PointForces:
+    """Contact forces with friction in two directions of each contact."""
+    slip = touch.slip
+    assert slip is not None
+    kept, tangents = jnp.concatenate(slip.kept), touch.tangents
+
+    return PointForces(
+        jnp.concatenate([normal.wrench, tangents], axis=1),
+        jnp.concatenate([normal.direction, tangents], axis=1),
+        jnp.concatenate([normal.cell] * 3, axis=1),
+        jnp.concatenate([normal.factors, kept * scale]),
+        jnp.concatenate([normal.corner, jnp.maximum(1 - kept, least)]),
+        jnp.concatenate([normal.handed, jnp.zeros_like(kept)]),
+        slip,
+    )
 
 
 def _bending_along(obstacle: Obstacle, base: Array | None, h: Array) -> Array | None:
@@ -249,7 +321,16 @@ def contacts_of(scene: Scene, sections: CrossSections, grid: Grid) -> Contacts |
         jnp.full_like(length, _LAST[1]),
         _first(scene, length),
         grid.h.shape[0],
+        _friction(scene.obstacles, grid.h.dtype),
     )
+
+
+def _friction(obstacles: tuple[Obstacle, ...], dtype: DTypeLike) -> Array | None:
+    """Coefficients of friction; None if no obstacle has any."""
+    if all(obstacle.friction is None for obstacle in obstacles):
+        return None
+    each = [0.0 if obstacle.friction is None else obstacle.friction for obstacle in obstacles]
+    return jnp.stack([jnp.asarray(x, dtype) for x in each])
 
 
 def _first(scene: Scene, length: Array) -> Array:

@@ -31,6 +31,7 @@ from ..numerics.damped_newton import HARDENING_STAGES, LOAD_INCREMENTS, SOFT_STA
 from ..numerics.quadrature import Grid
 from .balance import without_force
 from .reaction import Loading, Reaction
+from .slip import Slip
 from .touch import from_cells, received, to_cells
 
 HARDENING = HARDENING_STAGES / LOAD_INCREMENTS
@@ -99,6 +100,12 @@ class ArmProblem(NamedTuple):
         return any(coupling.softens for coupling in self.couplings)
 
     @property
+    def dissipates(self) -> Array | None:
+        """Whether the tangent of a coupling is not symmetric; None if never."""
+        each = [x for coupling in self.couplings if (x := coupling.dissipates()) is not None]
+        return sum(each[1:], each[0]) > 0 if each else None
+
+    @property
     def length(self) -> Array:
         """Length of the arm [m]."""
         return jnp.sum(self.grid.h, axis=0)
@@ -135,41 +142,63 @@ class Border(NamedTuple):
 
 class PointForces(NamedTuple):
     r"""Part of a coupling whose unknowns are forces at places of the arm, one or more per step, in
-    the tangent system: $\delta x = (s - f \, a^T z) / c$ with the motion z of the arm there and the
-    wrench a of a unit force. Springs of the stiffness $f a a^T / c$ stand for them in the
-    elimination, in place of a border.
+    the tangent system: $\delta x = (s - f \, a^T z) / c$ with the motion z of the arm there, and
+    the wrench w of a unit force, a without friction. Springs of the stiffness $f w a^T / c$ stand
+    for them in the elimination, in place of a border.
 
-    - `wrench`: a, in the world frame at an end of the cell of a node, shape (6, n, steps, ...).
+    - `wrench`, `direction`: w and a, in the world frame at an end of the cell of a node, shape (6,
+      n, steps, ...).
     - `cell`: 1 for that end, else 0, shape (stages + 1, n, steps, ...); the first end of each step
       is its start.
     - `factors`, `corner`: f and c, shape (n, steps, ...).
     - `handed`: 1 or -1 where the unknown of a step is part of the force of the next or the last
       one, else 0, shape (n, steps, ...); f is zero and c is 1 for it.
+    - `slip`: friction of the first n / 3 of them, which acts along the others; None without. Rows
+      and unknowns then are pairs: of contact forces (n / 3 * steps, ...) and of friction (3, n / 3
+      * steps, ...). Friction of pairs without `slip` is zero.
     """
 
     wrench: Array
+    direction: Array
     cell: Array
     factors: Array
     corner: Array
     handed: Array
+    slip: Slip | None = None
 
     def slopes(self) -> Array:
         """Derivatives (6, 6, stages, steps, ...) of the wrenches by the motions."""
         stiffness = -self.cell * self.factors / self.corner
-        square = self.wrench[:, None] * self.wrench
+        square = self.wrench[:, None] * self.direction
         return to_cells(jnp.sum(stiffness * square[:, :, None], axis=3), 2)
 
-    def pushes(self, rows: Array) -> Array:
+    def pushes(self, rows: PyTree) -> Array:
         """Changes (6, stages, steps, ...) of the wrenches by given rows (n * steps, ...) alone."""
-        force = rows.reshape(self.corner.shape) / self.corner
+        force = self._listed(rows) / self.corner
+        if self.slip is not None:  # friction on the arm is what its unknown is without the row
+            first, *tangents = jnp.split(self._listed(rows), 3)
+            force = force - jnp.concatenate([jnp.zeros_like(first), *tangents])
         return to_cells(jnp.sum(self.cell * (force * self.wrench)[:, None], axis=2), 1)
 
-    def change(self, rows: Array, motions: Array) -> Array:
+    def change(self, rows: PyTree, motions: Array) -> PyTree:
         """Changes of the unknowns for given rows and motions (6, stages, steps, ...)."""
         there = jnp.sum(self.cell * from_cells(motions, 1)[:, :, None], axis=1)
-        moved = self.factors * jnp.sum(self.wrench * there, axis=0)
-        change = (rows.reshape(moved.shape) - moved) / self.corner
-        return (change - received(self.handed, change)).reshape(rows.shape)
+        moved = self.factors * jnp.sum(self.direction * there, axis=0)
+        change = (self._listed(rows) - moved) / self.corner
+        change = change - received(self.handed, change)
+        if self.slip is None:
+            none = isinstance(rows, tuple)
+            return (change.reshape(rows[0].shape), rows[1]) if none else change.reshape(rows.shape)
+        force, first, second = jnp.split(change, 3)
+        friction = self.slip.change(force, first, second, rows[1].reshape(3, *force.shape))
+        return force.reshape(rows[0].shape), friction.reshape(rows[1].shape)
+
+    def _listed(self, rows: PyTree) -> Array:
+        """Rows (n, steps, ...)."""
+        if self.slip is None:
+            return (rows[0] if isinstance(rows, tuple) else rows).reshape(self.corner.shape)
+        along = self.slip.along(rows[1].reshape(self.slip.force.shape))
+        return jnp.concatenate([rows[0].reshape(along.shape[1:]), *along])
 
 
 class Coupling(eqx.Module):
@@ -269,6 +298,11 @@ class Coupling(eqx.Module):
 
     def points(self, x: PyTree, at: ArmState, note: Any, problem: ArmProblem) -> PointForces | None:
         """Its part of the tangent system, in place of a border; none by default."""
+        return None
+
+    def dissipates(self) -> Array | None:
+        """Whether it follows a law of friction, so that its tangent is not symmetric; None if
+        never, by default."""
         return None
 
     def clear(self, at: ArmState, note: Any, problem: ArmProblem) -> Array | bool:

@@ -49,7 +49,7 @@ from ..numerics.stacked import (
 )
 from .chords import Discs, Pull, discs_of, pull_of
 from .pose_terms import PoseTerm, base_of, finite, pose_terms
-from .touch import Surroundings, Touch, at_cells, contact_forces, touch_of
+from .touch import Surroundings, Touch, at_cells, contact_wrenches, touch_of
 
 
 class FollowerPoint(NamedTuple):
@@ -283,10 +283,9 @@ def react(xi: Vector, grid: Grid, loads: Loading, forces: Forces = ()) -> Reacti
             world = world + beyond(here, grid)
         else:
             world = world + term.before * here[:, None, None]
-    touch = None if loads.around is None else touch_of(axis, grid, loads.around)
+    touch = None if loads.around is None else touch_of(axis, R, grid, loads.around)
     if touch is not None:
-        pushed = contact_forces(touch)
-        world = world + jnp.concatenate([jnp.zeros_like(pushed), pushed])
+        world = world + contact_wrenches(touch)
     arm = cross(axis, rows(world, 3, 6))
     world, density = _with_moment(world, beyond(arm, grid)), _with_moment(density, arm)
     pull = None
@@ -413,8 +412,9 @@ def react_at(xi: Vector, grid: Grid, loads: Loading, X: Array, forces: Forces = 
     touch = along.touch
     if touch is not None:  # a contact force acts before its place, not by its share of the node
         before = (sigma < touch.sigma[:, step]) - touch.shares[0][:, step]
-        forces_there = (touch.force * touch.normal)[:, :, step]
-        world = world.at[3:].add(jnp.sum(before * forces_there, axis=1))
+        parts = (jnp.zeros_like(touch.push) if touch.moment is None else touch.moment), touch.push
+        there = jnp.concatenate(parts)[:, :, step]
+        world = world + jnp.sum(before * there, axis=1)
     return components(turned(transpose(R), world))
 
 

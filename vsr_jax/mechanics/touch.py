@@ -8,7 +8,7 @@ $$\sigma = \arg\min_s \, d(r(s)) - \rho(s) + \epsilon (2 s - 1)^2, \quad 0 \le s
 with the distance d to the obstacle and the polynomial r(s) through the step. The small $\epsilon$
 makes it unique where the arm lies along a surface, and is negligible where it does not; the least
 value is that which contact keeps from being negative, since its derivative is that of the gap at a
-given place. Without friction the contact force is $\lambda n$ with $n = \nabla d$.
+given place. The contact force is $\lambda n$ with $n = \nabla d$, and friction as in `slip`.
 
 As an arm slides, its contact passes from step to step. Where the nearest point of a step is its
 end, and the step beyond has a nearest point of its own, that step receives the force.
@@ -31,8 +31,9 @@ from ..arm.obstacles import Obstacle
 from ..arm.rod import Rod
 from ..numerics.batching import arms_in
 from ..numerics.quadrature import Grid, gauss_legendre, interpolation
-from ..numerics.stacked import columns, matmul, rows, skew
+from ..numerics.stacked import columns, cross, matmul, rows, skew
 from .pose_terms import base_of
+from .slip import Rough, Slip, slip_of
 
 _SAMPLES, _ITERATIONS = 5, 8
 """Points of a step from which the nearest one starts, and bound on the Newton steps from it."""
@@ -44,7 +45,7 @@ class Surroundings(NamedTuple):
     **Fields:** the `obstacles`, the `rod` and the position of its `base`; `flatness` $\epsilon$
     [m]; `lift` [m], added to all gaps; `stiffness` [N/m] and `width` [m] of penalties; `force` [N]
     of each obstacle on each step, shape (obstacles * steps, ...); `soft`: None, or 1 where
-    penalties stand for the forces.
+    penalties stand for the forces; `rough`: friction, None without.
     """
 
     obstacles: tuple[Obstacle, ...]
@@ -56,6 +57,7 @@ class Surroundings(NamedTuple):
     width: Array
     force: Array
     soft: Array | None
+    rough: Rough | None = None
 
 
 class Touch(NamedTuple):
@@ -63,11 +65,11 @@ class Touch(NamedTuple):
 
     **Fields:** `gap` [m], and `raised` by the term in epsilon; `normal` (3) and `place` (3) of the
     contact in the world; `sigma`, its place in the step; `shares` (stages) of a force there for the
-    nodes of the step; `force` [N]; `slope` (6, 6): derivative of the wrench by the motion of the
-    section, at a given force; `cell` (stages + 1): 1 for that end of the cells of the nodes which
-    is nearest, the first of them the start of the step; and `lever` (3) from there; `handed`: 1 or
-    -1 where the force of a step is handed on to the next or the last one, since the nearest point
-    is not in it, else 0.
+    nodes of the step; `force` [N]; `slip`: friction, None without; `slope` (6, 6): derivative of
+    the wrench by the motion of the section, at a given force; `cell` (stages + 1): 1 for that end
+    of the cells of the nodes which is nearest, the first of them the start of the step; and `lever`
+    (3) from there; `handed`: 1 or -1 where the force of a step is handed on to the next or the last
+    one, since the nearest point is not in it, else 0.
     """
 
     gap: Array
@@ -77,28 +79,66 @@ class Touch(NamedTuple):
     sigma: Array
     shares: Array
     force: Array
+    slip: Slip | None
     slope: Array
     cell: Array
     lever: Array
     handed: Array
 
+    @property
+    def push(self) -> Array:
+        """Force on the arm (3)."""
+        normal = self.force * self.normal
+        return normal if self.slip is None else normal + self.slip.force
+
+    @property
+    def moment(self) -> Array | None:
+        """Moment on the arm about its axis (3), None without friction."""
+        return None if self.slip is None else self.slip.moment
+
+    @property
+    def direction(self) -> Array:
+        """Wrench (6) of a unit contact force without friction about the end of the cell."""
+        return jnp.concatenate([cross(self.lever, self.normal), self.normal])
+
+    @property
+    def per_force(self) -> Array:
+        """Derivative (6) of the wrench about the end of the cell by the contact force."""
+        if self.slip is None:
+            return self.direction
+        return self.direction + self.slip.per_force * self._at_outline(self.slip.first)
+
+    @property
+    def tangents(self) -> Array:
+        """Wrenches (6) of unit friction forces in both directions about the end of the cell, those
+        in the second one after all in the first."""
+        assert self.slip is not None
+        both = self.slip.first, self.slip.second
+        return jnp.concatenate([self._at_outline(x) for x in both], axis=1)
+
+    def _at_outline(self, force: Array) -> Array:
+        """Wrench of a force at the outline about the end of the cell."""
+        assert self.slip is not None
+        return jnp.concatenate([cross(self.lever + self.slip.lever, force), force])
+
 
 class _Nearest(NamedTuple):
     """The nearest point of one step: place in the step, gap there without and with the term in
-    epsilon, normal, position, and the matrix of `Touch.slope` per force; 1 or -1 where points
-    beyond the end or the start of the step are nearer, else 0."""
+    epsilon, radius of the outline, normal, position, and the matrix of `Touch.slope` per force; 1
+    or -1 where points beyond the end or the start of the step are nearer, else 0."""
 
     sigma: Array
     gap: Array
     raised: Array
+    outline: Array
     normal: Array
     place: Array
     slope: Array
     nearer: Array
 
 
-def touch_of(axis: Array, grid: Grid, around: Surroundings) -> Touch:
-    """Contact for the axis p' at the nodes, shape (3, stages, steps, *arms)."""
+def touch_of(axis: Array, rotation: Array, grid: Grid, around: Surroundings) -> Touch:
+    """Contact for the axis p' (3, stages, steps, *arms) and the rotations at the nodes."""
     parts = jnp.sum(grid.weight * axis, axis=1)
     base = base_of(around.base, parts.ndim - 2)[:, None]
     starts = base + jnp.cumsum(parts, axis=1) - parts
@@ -123,6 +163,11 @@ def touch_of(axis: Array, grid: Grid, around: Surroundings) -> Touch:
         push = jnp.where(around.soft > 0, rate, 0.0) * near.normal[:, None] * near.normal[None]
         slope = (force * slope).at[3:, 3:].add(push)
     cumulative, weights = _weights(near.sigma, grid.X.shape[0])
+    slip = None
+    if around.rough is not None:
+        values = _values(near.sigma, grid.X.shape[0])
+        at = near.place, near.normal, force, near.outline
+        slip = slip_of(around.rough, *at, cumulative, values, rotation, grid)
     shares = cumulative / weights.reshape(-1, *(1,) * near.sigma.ndim)
     cell = _cell_of(near.sigma, grid.X.shape[0])
     along = jnp.pad(grid.weight * axis, [(0, 0), (1, 0), *[(0, 0)] * (axis.ndim - 2)])
@@ -136,6 +181,7 @@ def touch_of(axis: Array, grid: Grid, around: Surroundings) -> Touch:
         near.sigma,
         shares,
         force,
+        slip,
         slope,
         cell,
         lever,
@@ -143,18 +189,23 @@ def touch_of(axis: Array, grid: Grid, around: Surroundings) -> Touch:
     )
 
 
-def contact_forces(touch: Touch) -> Array:
-    """Force by all contacts beyond each node in the world, (3, stages, steps, *arms)."""
-    forces = touch.force * touch.normal
-    of_step = jnp.sum(forces, axis=1)
-    later = lax.cumsum(of_step, axis=1, reverse=True) - of_step
-    return later[:, None] + jnp.sum(touch.shares[None] * forces[:, None], axis=2)
+def contact_wrenches(touch: Touch) -> Array:
+    """Wrench by all contacts beyond each node in the world, (6, stages, steps, *arms), without the
+    moments of their forces about the node."""
+
+    def beyond(x: Array) -> Array:
+        of_step = jnp.sum(x, axis=1)
+        later = lax.cumsum(of_step, axis=1, reverse=True) - of_step
+        return later[:, None] + jnp.sum(touch.shares[None] * x[:, None], axis=2)
+
+    push, moment = beyond(touch.push), touch.moment
+    return jnp.concatenate([jnp.zeros_like(push) if moment is None else beyond(moment), push])
 
 
 def at_cells(touch: Touch) -> Array:
     """Derivatives (6, 6, stages, steps, *arms) of all contact wrenches by the motions of the ends
     of the cells of the nodes."""
-    d, f = skew(touch.lever), skew(touch.force * touch.normal)
+    d, f = skew(touch.lever), skew(touch.push)
     turned, moved = columns(touch.slope, 0, 3), columns(touch.slope, 3, 6)
     slope = jnp.concatenate([turned - matmul(moved, d), moved], axis=1)
     moment = rows(slope, 0, 3) + matmul(d, rows(slope, 3, 6))
@@ -226,6 +277,13 @@ def _weights(sigma: Array, stages: int) -> tuple[Array, Array]:
     return cumulative, jnp.asarray(gauss_legendre(stages)[1], sigma.dtype)
 
 
+def _values(sigma: Array, stages: int) -> Array:
+    """Weights (stages, ...) of the nodes in the polynomial at sigma."""
+    b = jnp.asarray(interpolation(stages), sigma.dtype)
+    powers = [sigma**p for p in range(stages)]
+    return jnp.stack([sum(b[p, j] * powers[p] for p in range(stages)) for j in range(stages)])
+
+
 def _nearest(
     obstacle: Obstacle, rod: Rod, flatness: Array, start: Array, axis: Array, X: Array, h: Array
 ) -> _Nearest:
@@ -245,7 +303,9 @@ def _nearest(
     slope = -jnp.where(inside, 1 / curvature, 0.0) * moved[:, None] * moved[None]
     at_end, at_start = (s >= 1) & (rate < 0), (s <= 0) & (rate > 0)
     nearer = at_end.astype(h.dtype) - at_start.astype(h.dtype)
-    return _Nearest(s, step.gap(s), step.lifted(s), normal, r, slope.at[3:, 3:].add(bend), nearer)
+    slope = slope.at[3:, 3:].add(bend)
+    outline = rod.outline(X + s * h)
+    return _Nearest(s, step.gap(s), step.lifted(s), outline, normal, r, slope, nearer)
 
 
 class _Step(NamedTuple):

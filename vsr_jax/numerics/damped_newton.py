@@ -39,6 +39,11 @@ contractions below which convergence is quadratic."""
 _CERTAIN, _NEAR = 0.1, 1e-4
 """Contraction of steps and residuals, and size of a step, below which the last step is taken
 without an evaluation after it: what it leaves is then known from the contraction."""
+_CUTS = 5
+"""Number of times that a step which does not lower the residual is halved where something slides
+with friction."""
+_SLIDING = 20
+"""Bound on the evaluations of a first attempt where something slides with friction."""
 _SETTLED = 0.05
 """Size of an undamped step below which springs are replaced by the constraints that they stand
 for."""
@@ -59,7 +64,7 @@ class Damped(NamedTuple):
     """Evaluation of one point and one damping for `damped_newton`: the step to subtract, its size,
     the residual, its size, whether the damped tangent is positive definite, whether that is
     doubtful, since it is far from symmetric, and, with constraints, whether they hold by a wide
-    margin."""
+    margin, and whether it has no energy at all, since something slides with friction."""
 
     step: Any
     size: Array
@@ -68,6 +73,7 @@ class Damped(NamedTuple):
     definite: Array
     doubtful: Array
     clear: Array | None = None
+    slides: Array | None = None
 
 
 class Measures(NamedTuple):
@@ -109,6 +115,7 @@ class _Guard(NamedTuple):
     probes: Array
     growth: Array
     clear: Array
+    cuts: Array
 
 
 def damped_newton(
@@ -197,10 +204,19 @@ def damped_newton(
         left = measures.work(new.residual, step)
         # the stages that are nearly exact have no energy
         hard = old.gradual & (applied >= increments + SOFT_STAGES)
+        if new.slides is not None:
+            hard = hard | (new.slides & ~old.gradual)
         taken = _accepted(old, new, left, floor, plain | hard, applied, increments)
+        worse = jnp.zeros_like(taken)
+        if new.slides is not None:
+            worse = new.slides & old.fresh & (old.applied == applied) & (old.cuts < _CUTS)
+            worse = worse & ~probe & ~(new.merit < jnp.maximum(old.merit, accepted))
+            taken = taken & ~worse
         guard, more, last = _judged(
             old, new, left, taken, plain | hard, damping, applied, floor, accepted, small
         )
+        again = old._replace(spent=guard.spent, cuts=old.cuts + 1)
+        guard = select(worse, again, guard._replace(cuts=jnp.zeros_like(old.cuts)))
         guard = guard._replace(plain=old.plain + plain.astype(jnp.int32))
         more = jnp.where(probe, 1.0, jnp.where(hard, 0.0, more))
         new_step = jax.tree.map(lambda s, last: s + more.astype(s.dtype) * last, new.step, step)
@@ -216,6 +232,9 @@ def damped_newton(
             new_step = select(linear, near, new_step)
             guard = guard._replace(rate=_slowest(old, guard, linear))
             earlier = select(taken, Earlier(new.step, step, earlier.proposed), earlier)
+        if new.slides is not None:
+            half = jax.tree.map(lambda s: 0.5 * s.astype(s.dtype), step)
+            new_step = select(worse, half, new_step)
         pull = jnp.where(taken, measures.work(new.residual, new_step), guard.pull)
         go = going(old)
         ratio = measures.turn(new_step) / measures.turn(step)
@@ -226,7 +245,9 @@ def damped_newton(
         x = select(go & taken, finished, x)
         if not twice:
             return x, new_step, earlier, guard
-        failed = jnp.where(go, ~(taken & new.definite), old.definite & ~guard.definite)
+        failed = jnp.where(go, ~((taken | worse) & new.definite), old.definite & ~guard.definite)
+        if new.slides is not None:
+            failed = failed | (go & (old.spent >= _SLIDING))
         again = ~old.gradual & failed
         guard = select(again, careful._replace(gradual=~careful.gradual, spent=guard.spent), guard)
         new_step = jax.tree.map(lambda s: jnp.where(again, 0.0, s).astype(s.dtype), new_step)
@@ -273,6 +294,7 @@ def _careful(floor: Array, increments: int) -> _Guard:
         probes=none,
         growth=zero + 1,
         clear=no,
+        cuts=none,
     )
 
 

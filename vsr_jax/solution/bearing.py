@@ -25,7 +25,9 @@ class Contact(NamedTuple):
 
     **Fields:** with the obstacles in the first axis and the steps in the second, the abscissa `X`
     [m]; `position` [m] of the axis in the world; `normal` of the obstacle; `gap` [m] between the
-    outline and the obstacle; `force` [N] along the normal, nearly 0 where they do not touch.
+    outline and the obstacle; `force` [N] along the normal, nearly 0 where they do not touch;
+    `friction` [N] on the arm, a vector of the world along the surface, zero unless the arm follows
+    a path of inputs (`vsr_jax.follow`).
     """
 
     X: Float[Array, "obstacles steps"]
@@ -33,12 +35,13 @@ class Contact(NamedTuple):
     normal: Float[Array, "obstacles steps 3"]
     gap: Float[Array, "obstacles steps"]
     force: Float[Array, "obstacles steps"]
+    friction: Float[Array, "obstacles steps 3"]
 
 
 def no_contact(dtype: DTypeLike) -> Contact:
     """That of an arm without obstacles."""
     none, vectors = jnp.zeros((0, 0), dtype), jnp.zeros((0, 0, 3), dtype)
-    return Contact(none, vectors, vectors, none, none)
+    return Contact(none, vectors, vectors, none, none, vectors)
 
 
 def supports_of(problem: ArmProblem, unknown: ArmUnknown) -> Float[Array, "supports 6"]:
@@ -53,12 +56,14 @@ def contacts_of(problem: ArmProblem, unknown: ArmUnknown) -> Contact:
     assert along is not None
     touch = along.touch
     assert touch is not None
+    slip = touch.slip
     return Contact(
         grid.start + touch.sigma * grid.h,
         jnp.moveaxis(touch.place, 0, -1),
         jnp.moveaxis(touch.normal, 0, -1),
         touch.gap,
         touch.force,
+        jnp.moveaxis(jnp.zeros_like(touch.normal) if slip is None else slip.force, 0, -1),
     )
 
 
@@ -142,7 +147,9 @@ def supported(problem: ArmProblem, unknown: ArmUnknown, free: tuple[int, ...]) -
     for coupling, x, note in zip(problem.couplings, unknown.coupled, at.notes, strict=True):
         if isinstance(coupling, Contacts):
             points = coupling.points(x, at, note, problem)
-            rows, corner = coupling.rows(at, note, grid), points.corner.reshape(-1)
+            # friction, of the points behind, does not hold an arm
+            rows = coupling.rows(at, note, grid)
+            corner = points.corner[: len(coupling.obstacles)].reshape(-1)
         else:
             border = coupling.border(x, at, note, problem)
             if border is None:

@@ -174,7 +174,7 @@ def wrenches_of(eq: Equilibrium) -> list[Acting]:
             found.append((pose, supports[i][None]))
     if eq.scene.obstacles:
         contacts = eq.contacts
-        pushes = contacts.force[..., None] * contacts.normal
+        pushes = contacts.force[..., None] * contacts.normal + contacts.friction
         wrenches = jnp.concatenate([jnp.zeros_like(pushes), pushes], axis=-1)
         poses = jnp.zeros((*contacts.X.shape, 4, 4), wrenches.dtype)
         found += list(zip(poses.at[..., :3, 3].set(contacts.position), wrenches, strict=True))
