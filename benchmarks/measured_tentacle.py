@@ -3,9 +3,10 @@ eight holds of series A, test on the eight of series B, compare models.
 
     pip install . && python benchmarks/measured_tentacle.py [--json FILE] [--plot PNG] [--free N]
 
-For each model: root mean square distance of the four markers on A, which is fitted, and on B, of
-which only the position of the base is fitted. `--free N` also runs Nelder-Mead and Powell with at
-most N solves of the whole series.
+For each model: root mean square distance of the four markers on A, which is fitted; on each hold of
+A, predicted from the other seven; and on B, of which only the base is fitted, its position or its
+pose. Models are chosen by the second of these, without B. `--free N` also runs Nelder-Mead and
+Powell with at most N solves of the whole series.
 """
 
 import argparse
@@ -13,6 +14,7 @@ import csv
 import json
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -74,8 +76,9 @@ def tentacle() -> vsr.Scene:
 
 
 def unknowns(*, moduli: int = 2) -> dict[str, vsr.Unknown]:
-    def near(value: float, sd: float, **options: Any) -> vsr.Unknown:
-        return vsr.Unknown(value - 4 * sd, value + 4 * sd, prior=(value, sd), **options)
+    def near(value: Any, sd: float, **options: Any) -> vsr.Unknown:
+        mean = np.asarray(value, float)
+        return vsr.Unknown(mean - 4 * sd, mean + 4 * sd, prior=(mean, sd), **options)
 
     return {
         MODULI: vsr.Unknown(5e4, 5e6, shared=moduli == 1),
@@ -89,16 +92,18 @@ def unknowns(*, moduli: int = 2) -> dict[str, vsr.Unknown]:
         f"{PATH}[1]": near(-0.0295, 0.002, shared=True),
         ANGLES[0]: near(np.deg2rad(30), 0.05),
         ANGLES[1]: near(np.deg2rad(150), 0.05),
+        "markers.offset": near(OFFSETS, 0.002),
     }
 
 
 STATED = {f"{PATH}[0]": 0.0114, f"{PATH}[1]": -0.0295} | dict(
     zip(ANGLES, np.deg2rad([30, 150]).tolist(), strict=True)
 )
-MODELS: dict[str, tuple[int, dict[str, float]]] = {
+MODELS: dict[str, tuple[int, dict[str, Any]]] = {
     "calibrated": (2, {}),
     "without friction": (2, {"actuators[*].friction": 0.0}),
     "one modulus, tendons end at 314 mm": (1, {"actuators[*].end": 0.314}),
+    "markers where stated": (2, {"markers.offset": OFFSETS}),
     "gains of one": (2, {"inputs.gain": 1.0}),
     "base not turned": (2, {"base.rotation[*]": 0.0}),
     "tendon paths as stated": (2, STATED),
@@ -124,10 +129,26 @@ def millimetres(fit: vsr.Fit) -> list[float]:
     return [round(1e3 * value, 2) for value in fit.rms().values()]
 
 
-def record_of(fit: vsr.Fit, test: vsr.Fit) -> dict[str, Any]:
+def turned(fit: vsr.Fit) -> vsr.Fit:
+    """The fit with a base rotation for each series."""
+    columns = [
+        c._replace(shared=False) if c.label.startswith("base.rotation") else c
+        for c in fit.problem.columns
+    ]
+    return vsr.Fit(replace(fit.problem, columns=tuple(columns)), fit.adjusted)
+
+
+def record_of(fit: vsr.Fit, data: vsr.Measurements) -> dict[str, Any]:
+    """What a fit of A says about A, and about B, the `data`."""
+    each, test = vsr.cross_validate(fit, folds=len(fit.problem.data)), fit.on(data)
     return {
         "rms on A [mm]": millimetres(fit),
+        "rms on each hold of A by the others [mm]": [
+            round(1e3 * value, 2) for value in each.rms().values()
+        ],
+        "mean square of these, in standard deviations": each.mean_square,
         "rms on B, held out [mm]": millimetres(test),
+        "rms on B with the base turned [mm]": millimetres(turned(fit).on(data)),
         "held-out chi squared": test.chi_squared,
         "status": fit.reason,
         "failed": [list(fit.failed), list(test.failed)],
@@ -153,15 +174,14 @@ def compared(
         fit = vsr.fit(tentacle(), free, train, model=MODEL, steps=STEPS, progress=False)
         seconds = time.perf_counter() - start
         fits[name] = fit
-        records[name] = record_of(fit, fit.on(test)) | {"seconds": seconds, "steps": fit.steps}
-        a, b = (records[name][f"rms on {key} [mm]"] for key in ("A", "B, held out"))
-        lost = [len(one) for one in records[name]["failed"]]
-        print(f"{name:34} A {a} B {b} failed {lost} {fit.reason}, {seconds:.0f} s", flush=True)
+        records[name] = record_of(fit, test) | {"seconds": seconds, "steps": fit.steps}
+        found = {k: v for k, v in records[name].items() if k not in ("numbers", "undetermined")}
+        print(f"{name}: {json.dumps(found)}", flush=True)
         write()
     return fits
 
 
-def held(free: dict[str, vsr.Unknown], label: str, value: float) -> dict[str, vsr.Unknown]:
+def held(free: dict[str, vsr.Unknown], label: str, value: Any) -> dict[str, vsr.Unknown]:
     """The unknowns with one, or all that its name matches, fixed."""
     name = label if label in free else label.rsplit("[", 1)[0]
     return free | {name: free[name]._replace(low=value, high=value)}
