@@ -133,6 +133,22 @@ def test_no_step_gives_up_a_shape():
     assert found.reason == "no step lowers the cost"
 
 
+def test_steps_end_at_an_edge():
+    """Beyond a circle a residual jumps; the minimum of the others lies there. A step towards it
+    that stays within is never long, and each gains a little."""
+
+    def evaluate(x, near):
+        del near
+        value = np.array([[3 * (x[0] - 2), x[1] - 1, 50.0 * (x @ x > 1)]])
+        slopes = np.array([[[3.0, 0.0], [0.0, 1.0], [0.0, 0.0]]])
+        return Residuals(value, slopes, np.array([True]))
+
+    found = minimise(evaluate, np.array([0.0, -0.9]), box(2))
+    assert found.reason == "no step lowers the cost"
+    assert found.steps <= 25
+    assert 0.99 < np.linalg.norm(found.x) <= 1
+
+
 def test_what_is_not_determined_is_named():
     """Only a b and c are determined, of a, b, c and d."""
 

@@ -62,3 +62,9 @@ def test_a_failed_shape_is_said_to_be(fit):
     # its arm is not drawn
     assert sum(len(np.asarray(line.get_xydata())) == 41 for line in ax.lines) == 3
     plt.close("all")
+
+
+def test_residuals_have_the_unit_of_the_measurement(fit):
+    ax = vsr.plot_fit.residuals(fit)
+    assert ax.get_ylabel() == "residual [m]"
+    plt.close("all")

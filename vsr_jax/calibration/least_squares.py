@@ -30,7 +30,8 @@ _NOISE_GAIN = 1e-2
 _FIRST_DAMPING, _TRIALS, _LEAST_RATIO = 1e-3, 9, 1e-4
 """Damping of the first step; how often it is raised, by 2, 4, 8 ..., for one step; share of the
 foreseen decrease that a step has to bring."""
-
+_IDLE = 3
+"""Steps in a row with a decrease below `_LEAST_GAIN` that are the last ones."""
 
 _KNOWN = 1e-6
 """Cosine of two directions above which an update of C is made; below, its denominator is nearly
@@ -111,21 +112,25 @@ def minimise(
     """
     here, damping, scale = evaluate(start, near), _FIRST_DAMPING, np.zeros(start.size)
     curvature, curved = np.zeros((start.size, start.size)), False
-    x, step = start, 0
+    x, step, idle = start, 0, 0
     while True:
         weights, cost = loss_of(loss, here.value)[1], _cost(here, here.solved, x, box, loss)
         if step:
             report(step, cost)
         A, slope, fixed = _quadratic(here, weights, x, box)
         H = A + curvature if curved and _convex(A + curvature, fixed) else A
-        gain = _expected(H, slope, fixed) / _variance(here.value, start.size)
+        variance = _variance(here.value, start.size)
+        gain = _expected(H, slope, fixed) / variance
         if gain <= _LEAST_GAIN:
             return Minimum(x, here, weights, cost, step, True, "converged")
         if step == steps:
             return Minimum(x, here, weights, cost, steps, False, f"stopped after {steps} steps")
         scale = np.maximum(scale, np.diag(A))
         size = np.where(scale > 0, scale, 1.0)
-        found = _descend(evaluate, x, here, (H, slope, fixed), size, damping, box, loss)
+        model = (H, slope, fixed)
+        found = None
+        if idle < _IDLE:
+            found = _descend(evaluate, x, here, model, size, damping, box, loss)
         if found is None:
             done = gain <= _NOISE_GAIN
             reason = "converged to rounding" if done else "no step lowers the cost"
@@ -133,6 +138,7 @@ def minimise(
         ahead, there, damping = found
         move = ahead - x
         gained = cost - _cost(there, here.solved, ahead, box, loss)
+        idle = idle + 1 if 2 * gained <= _LEAST_GAIN * variance else 0
         foreseen = -(slope @ move) - 0.5 * move @ A @ move
         curved = abs(foreseen - 0.5 * move @ curvature @ move - gained) < abs(foreseen - gained)
         curvature = _updated(curvature, here, there, move, np.sqrt(size), loss)

@@ -119,7 +119,9 @@ def residuals(fit: Fit, ax: Axes | None = None) -> Axes:
                 label=label,
             )
     ax.set_xticks(range(len(fit.residuals)), list(fit.residuals), rotation=30)
-    ax.set(ylabel="residual [unit of the measurement]")
+    units = {unit for one in fit.problem.data.observations for unit in one.units}
+    unit = units.pop() if len(units) == 1 else "unit of the measurement"
+    ax.set(ylabel=f"residual [{unit or '-'}]", ylim=(0, None))
     if len(fit.problem.data.groups) > 1:
         ax.legend(frameon=False)
     return ax
