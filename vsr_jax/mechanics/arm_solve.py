@@ -62,15 +62,19 @@ def solve_arm(problem: ArmProblem, free: tuple[int, ...], guess: ArmUnknown | No
     def whole(x: ArmUnknown, problem: ArmProblem) -> ArmUnknown:
         return x._replace(xi=completed(x.xi, problem.sections, free))
 
-    def imbalance(x: ArmUnknown, problem: ArmProblem, _: ArmUnknown | None) -> ArmImbalance:
+    def with_state(x: ArmUnknown, problem: ArmProblem) -> tuple[ArmImbalance, ArmState]:
         unknown = whole(x, problem)
-        return imbalance_of(unknown, state_of(unknown.xi, unknown.coupled, problem), problem, free)
+        at = state_of(unknown.xi, unknown.coupled, problem)
+        return imbalance_of(unknown, at, problem, free), at
+
+    def imbalance(x: ArmUnknown, problem: ArmProblem, _: ArmUnknown | None) -> ArmImbalance:
+        return with_state(x, problem)[0]
 
     def linear_solve(
         x: ArmUnknown, problem: ArmProblem, guess: ArmUnknown | None, right: ArmImbalance
     ) -> ArmUnknown:
-        _, apply = jax.linearize(lambda x: imbalance(x, problem, guess), x)
-        return tangent_solve(apply, whole(x, problem), problem, right, free)
+        _, apply, at = jax.linearize(lambda x: with_state(x, problem), x, has_aux=True)
+        return tangent_solve(apply, whole(x, problem), at, problem, right, free)
 
     def at_rest(x: ArmUnknown, problem: ArmProblem, guess: ArmUnknown | None) -> tuple:
         zero = jax.tree.map(jnp.zeros_like, x)

@@ -13,7 +13,7 @@ from jaxtyping import Array
 from ..numerics import component as c
 from ..numerics.component import Vector
 from ..typing import cast
-from .arm_balance import ArmImbalance, ArmUnknown, state_of
+from .arm_balance import ArmImbalance, ArmUnknown
 from .balance import free_components, spread, tangent
 from .coupling import ArmProblem, ArmState, bordered_solve, borders_of, points_of
 from .elimination import eliminate
@@ -104,6 +104,7 @@ def approximate_solve(
 def tangent_solve(
     apply: Callable,
     unknown: ArmUnknown,
+    at: ArmState,
     problem: ArmProblem,
     right: ArmImbalance,
     free: tuple[int, ...],
@@ -117,9 +118,9 @@ def tangent_solve(
     of loads and threads. It is symmetric where these have a potential, so that one norm serves both
     modes of differentiation.
 
-    **Arguments:** `apply`: product with A; of `unknown` and the result only the free strains count.
+    **Arguments:** `apply`: product with A; `at`: `state_of` the unknowns. Of `unknown` and the
+    result only the free strains count.
     """
-    at = state_of(unknown.xi, unknown.coupled, problem)
     flat, unravel_row = ravel_pytree(right)
     _, unravel_change = ravel_pytree(_free_part(unknown, free))
     to_row, to_change = lax.stop_gradient(_units(problem, free, right))

@@ -52,11 +52,12 @@ def make_grid(
     least = edges.size - 1
     place = np.arange(max(int(steps) if room is None else room, least))
     wanted = max(int(steps), least) if room is None else jnp.maximum(steps, least)
-    piece, count, at = (
-        (0, wanted, place) if least == 1 else _distributed(edges, wanted, jnp.asarray(place))
-    )
-    width = jnp.broadcast_to(jnp.diff(edges)[piece] / count, place.shape)
-    start = edges[:-1][piece] + at.astype(width.dtype) * width
+    if least == 1:
+        begin, width, at = edges[0], (edges[1] - edges[0]) / wanted, place
+    else:
+        begin, width, at = _distributed(edges, wanted, jnp.asarray(place))
+    width = jnp.broadcast_to(width, place.shape)
+    start = begin + at.astype(width.dtype) * width
     if room is not None:
         there = place < wanted
         width, start = jnp.where(there, width, 0.0), jnp.where(there, start, edges[-1])
@@ -67,17 +68,34 @@ def make_grid(
 def _distributed(
     edges: Float[Array, " edges"], steps: int | Array, place: Array
 ) -> tuple[Array, Array, Array]:
-    """For each step its piece, the number of steps of that piece and its place among them, by the
-    largest-remainder method."""
-    lengths = jnp.diff(edges)
+    """For each step the start of its piece, its own length and its place in the piece, by the
+    largest-remainder method.
+
+    A few pieces are ranked and looked up by comparing all of them, which compiles to a fraction of
+    the code of a sort, a search and gathers, whose derivatives scatter.
+    """
+    lengths = edges[1:] - edges[:-1]
+    pieces = np.arange(lengths.size)
     exact = (steps - lengths.size) * lengths / jnp.sum(lengths)
     whole = jnp.floor(exact)
-    order = jnp.argsort(jnp.argsort(whole - exact))
+    missing = exact - whole
+    ahead = (missing > missing[:, None]) | (
+        (missing == missing[:, None]) & (pieces < pieces[:, None])
+    )
     spare = steps - lengths.size - jnp.sum(whole).astype(int)
-    count = 1 + whole.astype(int) + (order < spare).astype(int)
+    count = 1 + whole.astype(int) + (jnp.sum(ahead, axis=1) < spare).astype(int)
     last = jnp.cumsum(count)
-    piece = jnp.minimum(jnp.searchsorted(last, place, side="right"), lengths.size - 1)
-    return piece, count[piece].astype(edges.dtype), place - (last - count)[piece]
+    piece = jnp.minimum(jnp.sum(last <= place[:, None], axis=1), lengths.size - 1)
+    own = piece[:, None] == pieces
+
+    def of_piece(values: Array) -> Array:
+        return jnp.sum(jnp.where(own, values, 0), axis=1)
+
+    return (
+        of_piece(edges[:-1]),
+        of_piece(lengths / count.astype(edges.dtype)),
+        place - of_piece(last - count),
+    )
 
 
 def interpolation(stages: int, origin: float = 0.0) -> np.ndarray:

@@ -11,8 +11,6 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from . import component
-
 
 def stack(components: tuple[Array, ...], axis: int = 0) -> Array:
     """Array of components that broadcast to one shape."""
@@ -69,7 +67,8 @@ def dot(a: Array, b: Array) -> Array:
 
 def cross(a: Array, b: Array) -> Array:
     """Vector product of two vectors."""
-    return stack(component.cross(components(a), components(b)))
+    a, b = jnp.concatenate([a, a]), jnp.concatenate([b, b])
+    return rows(a, 1, 4) * rows(b, 2, 5) - rows(a, 2, 5) * rows(b, 1, 4)
 
 
 def affine(a: Array, v: Array) -> Array:
