@@ -1,6 +1,6 @@
 """Arms in contact against solutions found by SciPy, where nothing of the package is used: shooting
-along the elastica, and the least energy of straight pieces with hinges between them, whose joints
-must not pass a wall."""
+along the elastica and along a rod in space, and the least energy of straight pieces with hinges
+between them, whose joints must not pass a wall."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -106,6 +106,59 @@ def test_an_arm_that_leans_on_a_pillar():
     np.testing.assert_allclose(eq.tip[[0, 2], 3], misses(unknown)[1], atol=1e-6 * L)
     np.testing.assert_allclose(contacts.X[0, at], unknown[1], atol=5e-6 * L)
     np.testing.assert_allclose(contacts.force.sum(), unknown[2] * EI, rtol=1e-5)
+
+
+def test_a_curved_arm_on_a_ball_in_space():
+    r"""Against shooting along a rod that bends and twists: $m' = f \times r'$ with the force f
+    beyond each section, $R' = R \hat k$ and $k = K^{-1} R^T m + k_0$. Unknown are the moment at
+    the base and the place, force and normal of the contact, where the axis is at the distance of
+    both radii from the centre and at right angles to the normal."""
+    load, moment = np.array([0.0, 2.0, -3.0]), np.array([0.6, 0.0, 0.0])
+    centre, radius = np.array([0.55, 0.1, -0.02]), 0.15
+    poisson, rest = 0.4, np.array([0.0, -1.0, 0.0])
+    stiffness = np.array([1 / (1 + poisson), 1.0, 1.0])
+
+    def piece(force, start, end, state):
+        def slope(_, y):
+            R = y[:9].reshape(3, 3)
+            k = R.T @ y[12:] / stiffness + rest
+            turn = np.cross(R, k)  # the rows of R times the skew matrix of k
+            return np.concatenate([turn.ravel(), R[:, 0], np.cross(force, R[:, 0])])
+
+        return solve_ivp(slope, (start, end), state, rtol=1e-11, atol=1e-13).y[:, -1]
+
+    def misses(unknown):
+        """Of the moment at the base, place, force and normal of the contact; and the tip."""
+        place, push, normal = unknown[3], unknown[4], unknown[5:]
+        base = np.concatenate([np.eye(3).ravel(), np.zeros(3), unknown[:3]])
+        there = piece(load + push * normal, 0.0, place, base)
+        tip = piece(load, place, 1.0, there)
+        apart = there[9:12] - centre - (radius + RADIUS / L) * normal
+        slides = normal @ there[[0, 3, 6]]
+        return np.array([*apart, slides, *(tip[12:] - moment), normal @ normal - 1]), tip
+
+    first = [-0.36, 2.5, 1.7, 0.5, 0.12, -0.6, 0.4, -0.7]
+    unknown = fsolve(lambda u: misses(u)[0], first, xtol=1e-13)
+    miss, tip = misses(unknown)
+    assert np.abs(miss).max() < 1e-10
+    material = vsr.Material(YOUNG, poisson=poisson)
+    scene = vsr.Scene(
+        vsr.Rod(L, vsr.Circular(RADIUS), material, rest_strain=(0, rest[1] / L, 0, 1, 0, 0)),
+        loads=[vsr.TipWrench(load * EI / L**2, moment * EI / L)],
+        obstacles=vsr.Sphere(centre * L, radius * L),
+        free_strains=("torsion", "bending_y", "bending_z"),
+    )
+    eq = vsr.solve(scene, jnp.zeros(0), model=vsr.StrainDependent(12), throw=True)
+    force = np.asarray(eq.contacts.force[0])
+    at = int(force.argmax())
+    np.testing.assert_allclose(eq.tip[:3, 3] / L, tip[9:12], atol=1e-7)
+    np.testing.assert_allclose(eq.tip[:3, :3], tip[:9].reshape(3, 3), atol=1e-7)
+    np.testing.assert_allclose(eq.contacts.X[0, at] / L, unknown[3], atol=1e-6)
+    np.testing.assert_allclose(force.sum() * L**2 / EI, unknown[4], rtol=1e-5)
+    np.testing.assert_allclose(eq.contacts.normal[0, at], unknown[5:], atol=1e-5)
+    # the arm leaves its plane by the load, the contact and its torsion
+    assert abs(tip[10]) > 0.4
+    assert np.ptp(eq.strain(np.linspace(0, L, 9))[:, 0]) * L > 1
 
 
 @pytest.mark.slow
