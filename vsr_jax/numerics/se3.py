@@ -20,7 +20,7 @@ from ..typing import Pose, Twist
 from . import component as c, stacked
 from .component import Matrix, Vector
 
-_TERMS = 11
+_TERMS = 12
 """Terms of the series: the first neglected one is below double precision for $\\theta^2 < 4$."""
 _SWITCH = 4.0
 """Value of $\\theta^2$ where the closed form takes over; below it loses digits, and its derivatives
