@@ -94,7 +94,8 @@ class _Guard(NamedTuple):
     the number of evaluations and of plain Newton steps; the number of undamped steps in a row under
     the same loads, by what factor the last of them became smaller, and their rate where they shrink
     linearly; whether the solution is to be probed, the number of probes, and the growth of the
-    motion in them; whether the constraints hold by a wide margin."""
+    motion in them; whether the constraints hold by a wide margin, and how often the step of what
+    slides was halved."""
 
     size: Array
     miss: Array
@@ -149,6 +150,8 @@ def damped_newton(
     - Stages. The stages of constraints without an energy accept every finite step, undamped; one
       that goes back by half of the last one is halved. Where the constraints hold by a wide margin,
       the last stage follows at once.
+    - Friction. What `slides` has no energy: its steps are accepted where the residual becomes
+      smaller, else halved, some times. Its first attempt has at most `_SLIDING` evaluations.
     - Probing. Where the tangent is doubtful at the end, the arm is moved from the solution by the
       last step, made small, and creeps: $s_{n+1} = s_n + (H + \mu \Sigma)^{-1} r(x - s_n)$. The
       solution is unstable if the motion grows after some steps.
@@ -207,16 +210,14 @@ def damped_newton(
         if new.slides is not None:
             hard = hard | (new.slides & ~old.gradual)
         taken = _accepted(old, new, left, floor, plain | hard, applied, increments)
-        worse = jnp.zeros_like(taken)
-        if new.slides is not None:
-            worse = new.slides & old.fresh & (old.applied == applied) & (old.cuts < _CUTS)
-            worse = worse & ~probe & ~(new.merit < jnp.maximum(old.merit, accepted))
-            taken = taken & ~worse
+        cut = None if new.slides is None else ~probe & _worse(old, new, applied, accepted)
+        taken = taken if cut is None else taken & ~cut
         guard, more, last = _judged(
             old, new, left, taken, plain | hard, damping, applied, floor, accepted, small
         )
-        again = old._replace(spent=guard.spent, cuts=old.cuts + 1)
-        guard = select(worse, again, guard._replace(cuts=jnp.zeros_like(old.cuts)))
+        if cut is not None:
+            shorter = old._replace(spent=guard.spent, cuts=old.cuts + 1)
+            guard = select(cut, shorter, guard._replace(cuts=jnp.zeros_like(old.cuts)))
         guard = guard._replace(plain=old.plain + plain.astype(jnp.int32))
         more = jnp.where(probe, 1.0, jnp.where(hard, 0.0, more))
         new_step = jax.tree.map(lambda s, last: s + more.astype(s.dtype) * last, new.step, step)
@@ -232,9 +233,8 @@ def damped_newton(
             new_step = select(linear, near, new_step)
             guard = guard._replace(rate=_slowest(old, guard, linear))
             earlier = select(taken, Earlier(new.step, step, earlier.proposed), earlier)
-        if new.slides is not None:
-            half = jax.tree.map(lambda s: 0.5 * s.astype(s.dtype), step)
-            new_step = select(worse, half, new_step)
+        if cut is not None:
+            new_step = select(cut, jax.tree.map(lambda s: 0.5 * s, step), new_step)
         pull = jnp.where(taken, measures.work(new.residual, new_step), guard.pull)
         go = going(old)
         ratio = measures.turn(new_step) / measures.turn(step)
@@ -245,9 +245,9 @@ def damped_newton(
         x = select(go & taken, finished, x)
         if not twice:
             return x, new_step, earlier, guard
-        failed = jnp.where(go, ~((taken | worse) & new.definite), old.definite & ~guard.definite)
-        if new.slides is not None:
-            failed = failed | (go & (old.spent >= _SLIDING))
+        failed = jnp.where(go, ~(taken & new.definite), old.definite & ~guard.definite)
+        if cut is not None:
+            failed = (failed & ~(go & cut)) | (go & (old.spent >= _SLIDING))
         again = ~old.gradual & failed
         guard = select(again, careful._replace(gradual=~careful.gradual, spent=guard.spent), guard)
         new_step = jax.tree.map(lambda s: jnp.where(again, 0.0, s).astype(s.dtype), new_step)
@@ -351,6 +351,13 @@ def _accepted(
         | plain
     )
     return ~old.fresh | (jnp.isfinite(new.merit) & better)
+
+
+def _worse(old: _Guard, new: Damped, applied: Array, accepted: Array) -> Array:
+    """Whether a step of what slides does not lower the residual, and is halved."""
+    assert new.slides is not None
+    here = new.slides & old.fresh & (old.applied == applied) & (old.cuts < _CUTS)
+    return here & ~(new.merit < jnp.maximum(old.merit, accepted))
 
 
 def _judged(
