@@ -7,12 +7,14 @@ import sys
 import time
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import vsr_jax as vsr
 from vsr_jax.analysis import progress
 from vsr_jax.cli import compiling
+from vsr_jax.numerics.compiling import quick_jit
 from vsr_jax.studies import paper
 
 MAIN = "import sys; from vsr_jax.cli.main import main; sys.exit(main())"
@@ -99,3 +101,29 @@ def test_reach_says_that_it_compiles_but_not_the_second_time(monkeypatch, capsys
     jax.clear_caches()
     reached(scene, target, progress=False)
     assert capsys.readouterr().err == ""
+
+
+def test_a_quick_program_goes_through_all_transformations():
+    calls = []
+
+    @quick_jit
+    def cube(x, shift=0.0):
+        calls.append(1)
+        return x**3 + shift
+
+    x = jnp.array(2.0)
+    assert cube(x) == cube(jnp.array(2.0), shift=0.0) == 8.0
+    assert len(calls) <= 2, "it compiled again for the same kind of arguments"
+    assert jax.jit(lambda: cube(x))() == 8.0  # known arguments, traced around
+    assert jax.jit(cube)(x) == 8.0
+    assert jax.grad(cube)(x) == jax.jit(jax.grad(cube))(x) == 12.0
+    np.testing.assert_allclose(jax.vmap(cube)(jnp.arange(3.0)), [0.0, 1.0, 8.0])
+
+
+def test_errors_of_a_quick_program_are_its_own():
+    @quick_jit
+    def refuses(x):
+        raise ValueError("x: got a number, need none")
+
+    with pytest.raises(ValueError, match="need none"):
+        refuses(jnp.zeros(()))

@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..arm.scene import Scene
 from ..models.base import Status
+from ..numerics.compiling import quick_jit
 from ..numerics.quadrature import onto
 from ..typing import VectorLike
 from ..validation import ROUNDING, choice, on_arm
@@ -87,7 +88,7 @@ class Quantity(_Entry, Generic[T]):
     def __init__(self, compute: Callable[..., T], unit: str, dims: tuple[str, ...] | None):
         super().__init__(compute, unit)
         self.dims = dims
-        self._program = eqx.filter_jit(self._masked)
+        self._program = quick_jit(self._masked)
 
     def _masked(self, eq: Solved) -> T:
         return eq.masked(self.compute(eq))
@@ -117,7 +118,7 @@ class AlongArm(_Entry):
     ):
         super().__init__(compute, unit)
         self.dims, self.of = dims, of
-        self._program = eqx.filter_jit(self.at)
+        self._program = quick_jit(self.at)
 
     def at(self, eq: Solved, X: Array) -> Array:
         """The value at abscissas that are checked."""
