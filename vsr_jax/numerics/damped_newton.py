@@ -222,9 +222,8 @@ def damped_newton(
         more = jnp.where(probe, 1.0, jnp.where(hard, 0.0, more))
         new_step = jax.tree.map(lambda s, last: s + more.astype(s.dtype) * last, new.step, step)
         if stages and measures.dot is not None:
-            same = hard & (old.applied == applied)
-            back = same & (measures.dot(new_step, step) < -0.5 * measures.dot(step, step))
-            half = jnp.where(back, 0.5, 1.0)
+            back = measures.dot(new_step, step) < -0.5 * measures.dot(step, step)
+            half = jnp.where(hard & ~old.clear & back, 0.5, 1.0)
             new_step = jax.tree.map(lambda s: half.astype(s.dtype) * s, new_step)
         if measures.dot is not None:
             tail = ~probe & (measures.turn(step) < _TAIL) & (new.size > small)
