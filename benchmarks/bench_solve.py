@@ -5,7 +5,7 @@ float32 and float64, in one run.
 
 The batch draws tensions uniformly from [-15, 0] N. "gradient" is the derivative of a tip
 coordinate, summed over the batch, with respect to every number of every routing. `--cold` adds the
-time from a cold process to the first tip of B1.
+times from a cold process to the first tip of B1 and of a rod under load.
 """
 
 import argparse
@@ -30,14 +30,34 @@ REPEATS = 15
 COLD = """
 import time; start = time.perf_counter()
 import jax; jax.config.update("jax_enable_x64", True)
+import jax.numpy as jnp
 import vsr_jax as vsr
 imported = time.perf_counter()
-arm = vsr.Rod(0.75, vsr.Circular(0.01), vsr.Material(5.93e5, shear=2.0e5))
-scene = vsr.Scene(arm, [vsr.Thread(vsr.Helix(0.005, 1.529))])
+{scene}
 built = time.perf_counter()
-vsr.solve(scene, [-15.0]).tip.block_until_ready()
+{options}
+vsr.solve(scene, inputs, model=model).tip.block_until_ready()
 print(imported - start, built - imported, time.perf_counter() - built)
 """
+COLD_SCENES = {
+    "B1": """
+arm = vsr.Rod(0.75, vsr.Circular(0.01), vsr.Material(5.93e5, shear=2.0e5))
+scene, inputs, model = vsr.Scene(arm, [vsr.Thread(vsr.Helix(0.005, 1.529))]), [-15.0], None
+""",
+    "steel rod under load": """
+arm = vsr.Rod(0.3, vsr.Circular(0.001), vsr.Material(200e9, poisson=0.3, density=7800.0))
+forces = [vsr.PointWrench(0.15, force=(0, 0, -0.5)), vsr.TipWrench(force=(0, 0.3, 0))]
+scene, inputs = vsr.Scene(arm, loads=[vsr.Gravity(), *forces]), jnp.zeros(0)
+model = vsr.StrainDependent(24)
+""",
+}
+COLD_OPTIONS = {
+    "as installed": "",
+    "without quick_compilation": """
+from vsr_jax.numerics import compiling
+compiling.quick_compilation = dict
+""",
+}
 
 
 def timed(function: Callable, *args: Any) -> dict[str, float]:
@@ -82,23 +102,23 @@ def measure(name: str, scene: vsr.Scene, model: vsr.StrainDependent, dtype: str)
     return row
 
 
-def cold_start(runs: int = 3) -> dict[str, float]:
-    """Median times [s] of import, build and solve up to the first tip of B1, each run in a new
-    process."""
-    rows = [
-        subprocess.run(
-            [sys.executable, "-c", COLD], capture_output=True, text=True, check=True
-        ).stdout.split()
-        for _ in range(runs)
-    ]
-    parts = np.median(np.array(rows, float), axis=0)
-    return dict(
-        zip(
-            ("import_s", "build_s", "solve_s", "total_s"),
-            [*map(float, parts), float(parts.sum())],
-            strict=True,
-        )
-    )
+def cold_start(runs: int = 3) -> dict[str, dict[str, float]]:
+    """Median times [s] of import, build and solve up to the first tip of each scene, with and
+    without the compiler options of the package, in turn, each run in a new process."""
+    rows: dict[str, list[list[str]]] = {}
+    for _ in range(runs):
+        for scene, lines in COLD_SCENES.items():
+            for name, options in COLD_OPTIONS.items():
+                program = COLD.format(scene=lines, options=options)
+                command = [sys.executable, "-c", program]
+                done = subprocess.run(command, capture_output=True, text=True, check=True)
+                rows.setdefault(f"{scene}, {name}", []).append(done.stdout.split())
+    found = {}
+    for name, times in rows.items():
+        parts = [*map(float, np.median(np.array(times, float), axis=0))]
+        keys = ("import_s", "build_s", "solve_s", "total_s")
+        found[name] = dict(zip(keys, [*parts, sum(parts)], strict=True))
+    return found
 
 
 def cell(entry: dict[str, float], per: int = 1) -> str:
@@ -121,10 +141,9 @@ def main() -> None:
     }
     if options.cold:
         report["cold"] = cold_start()
-        print(
-            "first result of a cold process [s]:",
-            ", ".join(f"{k} {v:.2f}" for k, v in report["cold"].items()),
-        )
+        print("first tip of a cold process [s]:")
+        for name, times in report["cold"].items():
+            print(f"{name}: {', '.join(f'{k} {v:.2f}' for k, v in times.items())}", flush=True)
     jax.config.update("jax_enable_x64", True)
     jobs = [
         ("A3, three threads", "A3", vsr.StrainDependent(32, 4)),
