@@ -35,7 +35,7 @@ from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import Grid, locate
 from ..numerics.se3 import base_pose, stacked_rotation
 from ..typing import DTypeLike
-from .coupling import SOFTENED, ArmProblem, ArmState, Coupling, PointForces
+from .coupling import HARDENED, SOFTENED, ArmProblem, ArmState, Coupling, PointForces
 from .held import of_forces
 from .pose_terms import finite
 from .reaction import Loading
@@ -108,7 +108,7 @@ class Contacts(Coupling):
             blur=(blur * length).astype(of),
             give=give.astype(of),
             flatness=jnp.maximum(self.flatness, _FLATTER * blur * length).astype(of),
-            friction=None if self.friction is None else (hardness >= 1) * self.friction,
+            friction=None if self.friction is None else (hardness > HARDENED) * self.friction,
         )
 
     def start(self, xi: Vector, problem: ArmProblem) -> Vector:

@@ -40,6 +40,9 @@ HARDENING = HARDENING_STAGES / LOAD_INCREMENTS
 SOFTENED = (SOFT_STAGES - 0.5) / HARDENING_STAGES
 """Hardness from which constraints have no energy."""
 
+HARDENED = 1 - 0.5 / HARDENING_STAGES
+"""Hardness from which constraints are exact, but for the rounding of the last stage."""
+
 Shares = tuple[Array | None, ...]
 """Share of each thread's force at the nodes; None for 1."""
 
