@@ -111,6 +111,13 @@ def base_of(base: Array, axes: int) -> Array:
     return base.reshape(3, *base.shape[1:], *(1,) * (axes + 1 - base.ndim))
 
 
+def starts_of(base: Array, axis: Array, grid: Grid) -> Array:
+    """Positions (3, steps, *arms) of the starts of the steps, for the axis p' (3, stages, steps,
+    *arms) at the nodes."""
+    parts = jnp.sum(grid.weight * axis, axis=1)
+    return base_of(base, parts.ndim - 2)[:, None] + jnp.cumsum(parts, axis=1) - parts
+
+
 def finite(tree: Any) -> Any:
     """Zero in place of all numbers that are not finite."""
     return jax.tree.map(lambda x: jnp.where(jnp.isfinite(x), x, jnp.zeros_like(x)), tree)

@@ -26,7 +26,7 @@ from jaxtyping import Array
 
 from ..numerics.quadrature import Grid
 from ..numerics.stacked import cross, matmul, matvec, transpose
-from .pose_terms import base_of
+from .pose_terms import starts_of
 
 _AT_LIMIT = 1 - 1e-6
 """Share of Coulomb's limit from which a contact slips: one that slipped before is at the limit, but
@@ -145,9 +145,7 @@ def _across(normal: Array) -> Array:
 
 def _old_place(traces: Traces, cumulative: Array, grid: Grid) -> Array:
     """Where the points of the axis at the contacts were (3, obstacles, steps, *arms)."""
-    parts = jnp.sum(grid.weight * traces.axis, axis=1)
-    base = base_of(traces.base, parts.ndim - 2)[:, None]
-    starts = base + jnp.cumsum(parts, axis=1) - parts
+    starts = starts_of(traces.base, traces.axis, grid)
     within = jnp.sum(cumulative * traces.axis[:, :, None], axis=1)
     return starts[:, None] + grid.h * within
 

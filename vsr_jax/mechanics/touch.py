@@ -32,7 +32,7 @@ from ..arm.rod import Rod
 from ..numerics.batching import arms_in
 from ..numerics.quadrature import Grid, gauss_legendre, interpolation
 from ..numerics.stacked import columns, cross, matmul, rows, skew
-from .pose_terms import base_of
+from .pose_terms import starts_of
 from .slip import Rough, Slip, slip_of
 
 _SAMPLES, _ITERATIONS = 5, 8
@@ -139,9 +139,7 @@ class _Nearest(NamedTuple):
 
 def touch_of(axis: Array, rotation: Array, grid: Grid, around: Surroundings) -> Touch:
     """Contact for the axis p' (3, stages, steps, *arms) and the rotations at the nodes."""
-    parts = jnp.sum(grid.weight * axis, axis=1)
-    base = base_of(around.base, parts.ndim - 2)[:, None]
-    starts = base + jnp.cumsum(parts, axis=1) - parts
+    starts = starts_of(around.base, axis, grid)
     near = _of_all(
         around.obstacles, (around.rod, around.flatness, starts, axis, grid.start, grid.h)
     )
@@ -271,16 +269,20 @@ def received(handed: Array, x: Array) -> Array:
 def _weights(sigma: Array, stages: int) -> tuple[Array, Array]:
     """Weights (stages, ...) of the integral from the start of a step of length 1 to sigma, and of
     that over the whole step."""
-    b = jnp.asarray(interpolation(stages), sigma.dtype)
-    powers = [sigma ** (p + 1) / (p + 1) for p in range(stages)]
-    cumulative = jnp.stack([sum(b[p, j] * powers[p] for p in range(stages)) for j in range(stages)])
+    cumulative = _by_nodes([sigma ** (p + 1) / (p + 1) for p in range(stages)])
     return cumulative, jnp.asarray(gauss_legendre(stages)[1], sigma.dtype)
 
 
 def _values(sigma: Array, stages: int) -> Array:
     """Weights (stages, ...) of the nodes in the polynomial at sigma."""
-    b = jnp.asarray(interpolation(stages), sigma.dtype)
-    powers = [sigma**p for p in range(stages)]
+    return _by_nodes([sigma**p for p in range(stages)])
+
+
+def _by_nodes(powers: list[Array]) -> Array:
+    """Weights (stages, ...) of the nodes in the polynomial through them, from its powers or
+    anything linear in them."""
+    stages = len(powers)
+    b = jnp.asarray(interpolation(stages), powers[0].dtype)
     return jnp.stack([sum(b[p, j] * powers[p] for p in range(stages)) for j in range(stages)])
 
 
