@@ -244,10 +244,11 @@ def _handed(nearer: Array, there: Array) -> Array:
     """1 or -1 where the force of a step belongs to the next or the last one, which has a nearest
     point of its own, else 0, shape (obstacles, steps, *arms).
 
-    Over more steps the forces of an arm that lies along a surface would jump to and fro."""
+    Over more steps the forces of an arm that lies along a surface would jump to and fro; where the
+    joint of two steps is nearest in both, the second one keeps the force."""
     own = there[None] & jnp.ones(nearer.shape, bool)
     next_own = _beside((own & (nearer <= 0)).astype(nearer.dtype), -1)
-    last_own = _beside((own & (nearer >= 0)).astype(nearer.dtype), 1)
+    last_own = _beside((own & (nearer == 0)).astype(nearer.dtype), 1)
     return jnp.where(nearer > 0, next_own, jnp.where(nearer < 0, -last_own, 0.0))
 
 
