@@ -12,6 +12,7 @@ from scipy.special import ellipe, ellipk
 import vsr_jax as vsr
 from vsr_jax.arm.rod import STRAINS
 from vsr_jax.files.scene_file import parse_scene, to_toml
+from vsr_jax.mechanics.touch import _handed
 
 L = 0.2
 NO_INPUTS = jnp.zeros(0)
@@ -183,6 +184,31 @@ def test_contact_has_exact_derivatives_and_batches(pressed):
     np.testing.assert_allclose(many[2], pressed.tip[2, 3], atol=1e-10)
     np.testing.assert_allclose(many[1], height(0.02, 0.01), atol=1e-10)
     assert abs(float(many[0])) < 1e-3  # 5 mN aside alone
+
+
+def test_many_arms_wait_in_a_queue():
+    """More arms than are solved at a time, and each is the arm alone."""
+
+    def tip(force):
+        eq = solved(vsr.TipWrench(force=force), obstacles=SPHERE, model=vsr.StrainDependent(4))
+        return eq.status, eq.steps, eq.tip[:3, 3]
+
+    random = np.random.default_rng(3)
+    forces = jnp.asarray(random.normal(size=(61, 3)) * [0.0, 0.01, 0.03])
+    status, steps, tips = jax.jit(jax.vmap(tip))(forces)
+    assert np.ptp(steps) > 5
+    one = jax.jit(tip)
+    for i in (0, 17, 48, 60):
+        assert one(forces[i])[0] == status[i]
+        np.testing.assert_allclose(tips[i], one(forces[i])[2], atol=1e-9)
+    assert int(jnp.sum(status == vsr.Status.CONVERGED)) == 61
+
+
+def test_of_two_steps_at_a_contact_one_has_its_force():
+    """Each step of which the nearest point is its end hands its force on, but not to one that would
+    hand it back: forces would change places for ever."""
+    handed = _handed(jnp.array([[1.0, -1.0, 0.0, 1.0, 1.0, 0.0]]), jnp.ones(6, bool))
+    np.testing.assert_array_equal(handed, [[1.0, 0.0, 0.0, 0.0, 1.0, 0.0]])
 
 
 def test_a_heavy_arm_lies_on_the_floor():

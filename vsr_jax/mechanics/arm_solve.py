@@ -10,7 +10,14 @@ from jax import lax
 from jaxtyping import Array
 
 from ..numerics import component as c
-from ..numerics.batching import TOGETHER, arms_in, side_by_side
+from ..numerics.batching import (
+    TOGETHER,
+    Iteration,
+    arms_in,
+    iterated,
+    queued,
+    side_by_side,
+)
 from ..numerics.component import Vector
 from ..numerics.damped_newton import (
     HARDENING_STAGES,
@@ -37,8 +44,9 @@ from .balance import (
 from .coupling import ArmProblem, ArmState, clear_of, forces_at
 from .sizes import shape_of, shape_size
 
-_FEW = 16
-"""Arms with constraints that are solved together: some need four times as many steps as most."""
+_LANES, _QUEUED = 48, 1024
+"""Arms with constraints that are solved at a time, and those that wait in one queue, at most: some
+need four times as many steps as most."""
 
 _START_STEPS = 4
 """Fixed-point steps to the start: each gains a factor of the strains that threads cause."""
@@ -55,7 +63,7 @@ def solve_arm(problem: ArmProblem, free: tuple[int, ...], guess: ArmUnknown | No
     def find(problem: ArmProblem, guess: ArmUnknown | None) -> Root:
         if guess is not None:  # the iteration does not change the locked strains
             guess = guess._replace(xi=with_locked(guess.xi, problem.sections, free))
-        together = _FEW if problem.softens else TOGETHER
+        together = _QUEUED if problem.softens else TOGETHER
         root = side_by_side(partial(_solve, free), together)(_start(problem, free), guess, problem)
         return root._replace(x=root.x._replace(xi=free_components(root.x.xi, free)))
 
@@ -206,6 +214,27 @@ def _solve(
     free: tuple[int, ...], origin: ArmUnknown, guess: ArmUnknown | None, whole: ArmProblem
 ) -> Root:
     arms = arms_in((origin, guess, whole), whole.grid.h.ndim - 1)
+    given = whole, origin, guess, jnp.broadcast_to(rounding_of(whole), arms)
+    if whole.softens and arms and arms[0] > _LANES:
+        root = queued(partial(_iteration, free, (_LANES,)), given, arms[0], _LANES)
+    else:
+        root = iterated(_iteration(free, arms, given))
+    if whole.dissipates is None:
+        return root
+    at = state_of(root.x.xi, root.x.coupled, whole)
+    imbalance = imbalance_of(root.x, at, whole, free)
+    _, definite, _ = approximate_solve(root.x, at, imbalance, whole, free, symmetric=True)
+    return root._replace(definite=definite)
+
+
+def _iteration(
+    free: tuple[int, ...],
+    arms: tuple[int, ...],
+    given: tuple[ArmProblem, ArmUnknown, ArmUnknown | None, Array],
+) -> Iteration:
+    """Newton's method for a batch of arms: their problem, where it begins, a guess, and the
+    rounding of its residual."""
+    whole, origin, guess, floor = given
     start, origin = jax.tree.map(
         lambda x: jnp.broadcast_to(x, (*x.shape[: x.ndim - len(arms)], *arms)),
         (origin if guess is None else guess, origin),
@@ -230,24 +259,14 @@ def _solve(
         wrench = c.single(imbalance.wrench)
         return Damped(step, size, wrench, merit, definite, doubtful, clear, slides)
 
-    shares = 1 if whole.loads is None else LOAD_INCREMENTS
-    floor = jnp.broadcast_to(rounding_of(whole), arms)
-    again = None if guess is None else origin
-    measures = Measures(
-        sizes.work, sizes.turn, sizes.dot if whole.follows_rate or whole.softens else None
-    )
-    root = damped_newton(
+    return damped_newton(
         evaluate,
-        measures,
+        Measures(
+            sizes.work, sizes.turn, sizes.dot if whole.follows_rate or whole.softens else None
+        ),
         start,
         floor,
-        shares,
-        again,
+        1 if whole.loads is None or whole.softens else LOAD_INCREMENTS,
+        None if guess is None else origin,
         stages=HARDENING_STAGES if whole.softens else 0,
     )
-    if whole.dissipates is None:
-        return root
-    at = state_of(root.x.xi, root.x.coupled, whole)
-    imbalance = imbalance_of(root.x, at, whole, free)
-    _, definite, _ = approximate_solve(root.x, at, imbalance, whole, free, symmetric=True)
-    return root._replace(definite=definite)

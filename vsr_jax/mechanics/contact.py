@@ -12,11 +12,20 @@ place unique. The minimum is smoothed over a length b, in the end 1e-9 of the ar
 $$\lambda (k g + c \lambda) = (k b)^2, \quad \lambda > 0.$$
 
 Newton's method solves for forces and shape together, with nearly rigid springs in place of the
-contacts in the elimination along the arm (`PointForces`).
+contacts in the elimination along the arm (`PointForces`). With $s = k g + c \lambda$ its rows are
+those of the smooth minimum (Kanzow 1996), but where force and gap are both positive and their
+product is too large,
 
-On the way to a solution that this does not find at once, b is 0.1 of the arm and c is 0.01 while
-the loads grow. The force is then given by the gap, $\lambda = \tfrac{k}{2 c} (\sqrt{g^2 + 4 c b^2}
-- g)$, so that the balance is the gradient of an energy, which shows whether a step is an advance.
+$$\frac{\lambda s - (k b)^2}{\lambda + s}, \quad \text{as a line}\quad
+\frac{s \, \delta\lambda + \lambda \, \delta s}{\lambda + s},$$
+
+the step of primal-dual interior-point methods (Nocedal and Wright 2006, chapter 19). A force far
+from its wall then fades as b becomes smaller; by the line of the smooth minimum every contact with
+$\lambda > s$ closes its gap at once, which throws the arm about.
+
+From the rest shape b begins as 0.1 of the arm and c as 0.02. The force is then given by the gap,
+$\lambda = \tfrac{k}{2 c} (\sqrt{g^2 + 4 c b^2} - g)$, so that the balance is the gradient of an
+energy, which shows whether a step is an advance; a creeping motion under all loads approaches it.
 After that both become smaller together. Friction (see `slip`) comes last.
 """
 
@@ -43,8 +52,8 @@ from .sizes import softest
 from .slip import Rough, Traces, moved_to
 from .touch import Surroundings, Touch
 
-_FIRST, _LAST = (0.1, 1e-2), (1e-9, 1e-10)
-"""Length b, as a fraction of the arm's, and compliance c, while the loads grow and in the end."""
+_FIRST, _LAST = (0.1, 2e-2), (1e-9, 1e-10)
+"""Length b, as a fraction of the arm's, and compliance c, to begin with and in the end."""
 
 _ROOMY = 0.3
 """Room between arm and wall, as a fraction of the arm's length, below which both are smaller from
@@ -72,7 +81,7 @@ class Contacts(Coupling):
 
     **Fields:** the `obstacles`, the `rod` and the position of its `base`; the stiffness k, `scale`;
     `flatness` and `lift` of `Surroundings`; the length b, `blur`, and the compliance c, `give`, and
-    both while the loads grow, `first`; the number of `steps`; the coefficients of `friction`, None
+    both to begin with, `first`; the number of `steps`; the coefficients of `friction`, None
     without; `soft`: 1 where the gaps give the forces; `traces`: what the contacts remember where
     the arm follows a path of inputs, None without.
     """
@@ -189,7 +198,7 @@ class Contacts(Coupling):
     ) -> PyTree:
         force, own = note.force, self._forces(x).reshape(note.force.shape)
         pushed = self.scale * note.raised + self.give * force
-        rows = 0.5 * (force + pushed - self._root(force - pushed))
+        rows, _ = self._smooth_minimum(force, pushed)
         rows = jnp.where(note.handed != 0, own, rows)
         if self.soft is not None:
             rows = jnp.where(self.soft > 0, own - force, rows)
@@ -199,10 +208,11 @@ class Contacts(Coupling):
         return rows, x[1] if note.slip is None else note.slip.row.reshape(x[1].shape)
 
     def points(self, x: PyTree, at: ArmState, note: Touch, problem: ArmProblem) -> PointForces:
-        apart = (1 - self.give) * note.force - self.scale * note.raised
+        pushed = self.scale * note.raised + self.give * note.force
+        _, by_gap = self._smooth_minimum(note.force, pushed)
         free = 1 - jnp.abs(note.handed)
         free = free if self.soft is None else (1 - self.soft) * free
-        pushing = 0.5 * free * (1 + apart / self._root(apart))
+        pushing = free * by_gap
         least = float(jnp.finfo(free.dtype).eps) ** _RIGID
         normal = PointForces(
             free * note.per_force,
@@ -245,9 +255,16 @@ class Contacts(Coupling):
 
         return jax.tree.map(gathered, x)
 
-    def _root(self, apart: Array) -> Array:
-        """A smooth absolute value of the difference of force and scaled gap."""
-        return jnp.sqrt(apart**2 + (2 * self.scale * self.blur) ** 2)
+    def _smooth_minimum(self, force: Array, pushed: Array) -> tuple[Array, Array]:
+        """The smoothed minimum of force and scaled gap, and its derivative by the gap where it is
+        approximated by a line."""
+        apart, square = force - pushed, (self.scale * self.blur) ** 2
+        root = jnp.sqrt(apart**2 + 4 * square)
+        total, excess = force + pushed, force * pushed - square
+        inside = (force > 0) & (pushed > 0) & (excess > 0)
+        total = jnp.where(inside, total, 1.0)
+        smooth = jnp.where(inside, excess / total, 0.5 * (force + pushed - root))
+        return smooth, 0.5 * (1 + apart / jnp.where(inside, total, root))
 
     def sizes(self, x: PyTree, at: ArmState, problem: ArmProblem) -> list[Array]:
         return [force / (self.scale * problem.length) for force in jax.tree.leaves(x)]
@@ -334,8 +351,8 @@ def _friction(obstacles: tuple[Obstacle, ...], dtype: DTypeLike) -> Array | None
 
 
 def _first(scene: Scene, length: Array) -> Array:
-    """Length b, as a fraction of the arm's, and compliance c while the loads grow: smaller where a
-    lumen leaves the arm little room."""
+    """Length b, as a fraction of the arm's, and compliance c to begin with: smaller where a lumen
+    leaves the arm little room."""
     blur, give = (jnp.full_like(length, x) for x in _FIRST)
     for obstacle in scene.obstacles:
         room = obstacle.room

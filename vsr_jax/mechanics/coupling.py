@@ -27,15 +27,12 @@ from jaxtyping import Array, PyTree
 from ..arm.scene import CrossSections, Scene
 from ..numerics import component as c, lu
 from ..numerics.component import Forces, Vector
-from ..numerics.damped_newton import HARDENING_STAGES, LOAD_INCREMENTS, SOFT_STAGES
+from ..numerics.damped_newton import HARDENING_STAGES, SOFT_STAGES
 from ..numerics.quadrature import Grid
 from .balance import without_force
 from .reaction import Loading, Reaction
 from .slip import Slip
 from .touch import from_cells, received, to_cells
-
-HARDENING = HARDENING_STAGES / LOAD_INCREMENTS
-"""By what the fraction of the loads exceeds 1 where constraints are exact."""
 
 SOFTENED = (SOFT_STAGES - 0.5) / HARDENING_STAGES
 """Hardness from which constraints have no energy."""
@@ -67,13 +64,12 @@ class ArmProblem(NamedTuple):
 
     def with_share(self, share: Array) -> "ArmProblem":
         """The problem with a fraction of its loads. Constraints that soften are springs up to the
-        fraction 1, with all loads; above it they harden to the fraction 1 + `HARDENING`, where they
-        are exact."""
+        fraction 1, with all loads; above it they harden up to 2, where they are exact."""
         if self.loads is None:
             return self
         if not self.softens:
             return self._replace(loads=self.loads.scaled(share))
-        hardness = jnp.maximum(share - 1.0, 0.0) / HARDENING
+        hardness = jnp.maximum(share - 1.0, 0.0)
         couplings = tuple(coupling.softened(hardness) for coupling in self.couplings)
         return self._replace(loads=self.loads.scaled(jnp.minimum(share, 1.0)), couplings=couplings)
 

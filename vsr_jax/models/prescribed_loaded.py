@@ -20,9 +20,15 @@ from ..mechanics.balance import ALL, residual, tangent, without_force
 from ..mechanics.coupling import ArmProblem, ArmState, borders_of
 from ..mechanics.reaction import reaction_change, slopes_of
 from ..numerics import component as c, lu
-from ..numerics.batching import arms_in, side_by_side
+from ..numerics.batching import arms_in, iterated, side_by_side
 from ..numerics.component import Vector
-from ..numerics.damped_newton import LOAD_INCREMENTS, MAX_TURN, Damped, Measures, damped_newton
+from ..numerics.damped_newton import (
+    LOAD_INCREMENTS,
+    MAX_TURN,
+    Damped,
+    Measures,
+    damped_newton,
+)
 from ..numerics.implicit import implicit_root
 from ..numerics.newton import Root
 from ..numerics.quadrature import Grid
@@ -305,7 +311,7 @@ def _solve(basis: NodalBasis, problem: ArmProblem) -> Root:
     floor = jnp.broadcast_to(rounding_of(problem), arms)
     shares = 1 if problem.loads is None else LOAD_INCREMENTS
     measures = Measures(work, turn, dot if problem.follows_rate else None)
-    return damped_newton(evaluate, measures, first, floor, shares)
+    return iterated(damped_newton(evaluate, measures, first, floor, shares))
 
 
 def _doubtful(J: Array, elastic: Array) -> Array:

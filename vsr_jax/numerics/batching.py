@@ -2,13 +2,16 @@
 contiguous rows."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.custom_batching import custom_vmap
+from jaxtyping import Array
+
+from .component import select
 
 TOGETHER = 136
 """Arms that are solved together, at most: the arrays of one pass then stay in the cache."""
@@ -69,3 +72,73 @@ def side_by_side(solve: Callable, together: int = TOGETHER) -> Callable:
 def arms_in(tree: Any, axes: int) -> tuple[int, ...]:
     """Shape of the batch of arms: what the last `axes` axes of all arrays broadcast to."""
     return np.broadcast_shapes(*(x.shape[x.ndim - axes :] for x in jax.tree.leaves(tree)))
+
+
+class Iteration(NamedTuple):
+    """An iteration of several problems, with one entry per problem in the last axis of each array:
+    the state at its beginning, given any state or None; the step to the next state, which leaves
+    problems alone that are done; which of them are not; and what a state means as a result."""
+
+    begin: Callable[[Any], Any]
+    advance: Callable[[Any], Any]
+    busy: Callable[[Any], Array]
+    result: Callable[[Any], Any]
+
+
+class _Queue(NamedTuple):
+    """State of `queued`: that of the problems in the lanes, which ones they are, and their data;
+    the first problem that has not begun; and the results of those that are done."""
+
+    state: Any
+    place: Array
+    data: Any
+    waiting: Array
+    results: Any
+
+
+def iterated(iteration: Iteration) -> Any:
+    """The results of all problems at the end."""
+    end = lax.while_loop(
+        lambda state: jnp.any(iteration.busy(state)), iteration.advance, iteration.begin(None)
+    )
+    return iteration.result(end)
+
+
+def queued(iteration: Callable[[Any], Iteration], data: Any, problems: int, lanes: int) -> Any:
+    """As `iterated`, with as many problems at a time as there are `lanes`: where one is done, the
+    next one begins, so that none waits for the slowest.
+
+    **Arguments:** `iteration`: that of the problems with some data; `data`: arrays whose last axis
+    is that of all problems, or of size 1.
+    """
+
+    def chosen(place: Array) -> Any:
+        return jax.tree.map(lambda x: x if x.shape[-1] == 1 else x[..., place], data)
+
+    def advance(queue: _Queue) -> _Queue:
+        current = iteration(queue.data)
+        state = current.advance(queue.state)
+        done = (queue.place < problems) & ~current.busy(state)
+        queue = queue._replace(state=state)
+        return lax.cond(jnp.any(done), refilled, lambda queue, _: queue, queue, done)
+
+    def refilled(queue: _Queue, done: Array) -> _Queue:
+        found = iteration(queue.data).result(queue.state)
+        target = jnp.where(done, queue.place, problems)
+        results = jax.tree.map(
+            lambda every, x: every.at[..., target].set(x, mode="drop"), queue.results, found
+        )
+        following = queue.waiting + jnp.cumsum(done) - 1
+        place = jnp.where(done, jnp.minimum(following, problems), queue.place)
+        given = chosen(jnp.minimum(place, problems - 1))
+        begins = done & (place < problems)
+        state = select(begins, iteration(given).begin(queue.state), queue.state)
+        return _Queue(state, place, given, queue.waiting + jnp.sum(done), results)
+
+    given = chosen(jnp.arange(lanes))
+    first = iteration(given)
+    state = first.begin(None)
+    shapes = jax.eval_shape(first.result, state)
+    results = jax.tree.map(lambda x: jnp.zeros((*x.shape[:-1], problems), x.dtype), shapes)
+    begin = _Queue(state, jnp.arange(lanes), given, jnp.array(lanes), results)
+    return lax.while_loop(lambda queue: jnp.any(queue.place < problems), advance, begin).results

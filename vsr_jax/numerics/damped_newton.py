@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array
 
 from .acceleration import Earlier, accelerated
+from .batching import Iteration
 from .component import select
 from .newton import Root
 
@@ -20,15 +20,16 @@ MAX_PLAIN_STEPS = 25
 LOAD_INCREMENTS = 5
 """Increments in which `damped_newton` applies the loads where they cannot be applied at once: the
 tangent is often indefinite at the start under all loads."""
-SOFT_STAGES, HARDENING_STAGES = 1, 8
+SOFT_STAGES, HARDENING_STAGES = 1, 5
 """Number of increments after the loads with springs in place of constraints, which have an energy,
 and of all by which constraints harden in `damped_newton`."""
 MAX_TURN = 1.5
 """Bound on the angle [rad] by which one step of a loaded solve bends and twists the arm. A step
 that coils the arm may lower the residual without approaching a solution."""
-_MIN_DAMPING, _MAX_DAMPING = 0.1, 1e8
-"""First damping above zero, and the damping at which plain Newton steps take over."""
-_RAISE, _LOWER = 10.0, 30.0
+_FIRST_DAMPING, _MIN_DAMPING, _MAX_DAMPING = 1.0, 0.3, 1e8
+"""Damping to begin with where the loads are applied at once, least one above zero, and that at
+which plain Newton steps take over."""
+_RAISE, _LOWER = 8.0, 4.0
 """Factor by which damping rises after a rejected step, and divisor after an accepted one."""
 _MIN_CONTRACTION, _MAX_CONTRACTION = 0.25, 0.99
 """Contraction of the residual above which a step is extrapolated, and the largest that is used: it
@@ -44,7 +45,7 @@ _CUTS = 5
 with friction."""
 _SLIDING = 20
 """Bound on the evaluations of a first attempt where something slides with friction."""
-_SETTLED = 0.05
+_SETTLED = 0.3
 """Size of an undamped step below which springs are replaced by the constraints that they stand
 for."""
 _ACCEPTED = 64
@@ -128,7 +129,7 @@ def damped_newton(
     origin: Any = None,
     *,
     stages: int = 0,
-) -> Root:
+) -> Iteration:
     r"""Root of a residual that is the gradient of an energy, or nearly so, by Newton's method with
     Levenberg damping.
 
@@ -141,7 +142,7 @@ def damped_newton(
       accepted, and at the first tangent that is not positive definite, the problem begins again
       from `origin`: the loads are then applied in equal increments, one per accepted step, and
       steps are always accepted until all loads are applied. A problem with neither increments nor
-      an `origin` begins with the careful attempt.
+      an `origin` begins with the careful attempt, and with a first damping.
     - Extrapolation. The tangent may be approximate. Where it is much too stiff for a soft motion of
       the arm, the residual along a full step contracts only by $\rho$ near 1. The next step then
       includes $\rho^2 / (1 - \rho)$ of the last one, the remainder of the geometric series.
@@ -176,9 +177,10 @@ def damped_newton(
     - `stages`: further increments after the loads, each once the problem before it is nearly
       solved: of constraints that are springs first and exact in the last one.
 
-    **Returns:** a `Root`; it is converged if the residual at the end is rounding or as small as a
-    negligible step.
+    **Returns:** the `Iteration`, whose result is a `Root`: it is converged if the residual is
+    rounding or as small as a negligible step.
     """
+    evaluate = jax.jit(evaluate, inline=True)  # traced once for its shapes and in the loop
     twice = increments > 1 or origin is not None
     origin = start if origin is None else origin
     levels = increments + stages
@@ -203,10 +205,13 @@ def damped_newton(
         plain = (old.spent >= MAX_DAMPED_STEPS) | (old.damping >= _MAX_DAMPING) | (old.plain > 0)
         trial = jax.tree.map(lambda a, s: jnp.where(old.fresh, a - s.astype(a.dtype), a), x, step)
         damping, applied = _attempt(old, plain, increments, levels)
-        new = evaluate(trial, jnp.where(probe, _PROBE_DAMPING, damping), applied / increments)
+        share = jnp.minimum(applied / increments, 1.0)
+        if stages:
+            share = share + jnp.maximum(applied - increments, 0.0) / stages
+        new = evaluate(trial, jnp.where(probe, _PROBE_DAMPING, damping), share)
         left = measures.work(new.residual, step)
         # the stages that are nearly exact have no energy
-        hard = old.gradual & (applied >= increments + SOFT_STAGES)
+        hard = (old.gradual | (not twice)) & (applied >= increments + SOFT_STAGES)
         if new.slides is not None:
             hard = hard | (new.slides & ~old.gradual)
         taken = _accepted(old, new, left, floor, plain | hard, applied, increments)
@@ -256,23 +261,27 @@ def damped_newton(
     if twice:
         whole = jnp.full_like(floor, levels)
         first = careful._replace(applied=whole, damping=jnp.zeros_like(floor))
-    step = jax.tree.map(
-        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
-        jax.eval_shape(evaluate, start, floor, floor).step,
-    )
-    earlier = None if measures.dot is None else Earlier(step, step, step)
-    begin = (start, step, earlier, first)
-    x, _, _, guard = lax.while_loop(
-        lambda state: jnp.any(going(state[3]) | probing(state[3])), advance, begin
-    )
-    return Root(x, guard.merit <= accepted, guard.definite, guard.spent)
+
+    def begin(like: tuple | None) -> tuple:
+        step = jax.eval_shape(evaluate, start, floor, floor).step if like is None else like[1]
+        step = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), step)
+        return start, step, None if measures.dot is None else Earlier(step, step, step), first
+
+    def busy(state: tuple) -> Array:
+        return going(state[3]) | probing(state[3])
+
+    def root(state: tuple) -> Root:
+        x, _, _, guard = state
+        return Root(x, guard.merit <= accepted, guard.definite, guard.spent)
+
+    return Iteration(begin, advance, busy, root)
 
 
 def _careful(floor: Array, increments: int) -> _Guard:
     """State of every problem before the first evaluation of the careful attempt."""
     zero, no = jnp.zeros_like(floor), jnp.zeros(floor.shape, bool)
     none = jnp.zeros(floor.shape, jnp.int32)
-    damping = jnp.full_like(floor, 0.0 if increments > 1 else _MIN_DAMPING)
+    damping = jnp.full_like(floor, 0.0 if increments > 1 else _FIRST_DAMPING)
     return _Guard(
         size=zero,
         miss=zero,
@@ -437,4 +446,4 @@ def _raised(damping: Array) -> Array:
 
 
 def _lowered(damping: Array) -> Array:
-    return jnp.where(damping > 1e-2 * _MIN_DAMPING, damping / _LOWER, 0.0)
+    return jnp.where(damping >= _LOWER * _MIN_DAMPING, damping / _LOWER, 0.0)
