@@ -23,7 +23,7 @@ import vsr_jax as vsr
 
 jax.config.update("jax_enable_x64", True)
 
-LENGTH, RADIUS, YOUNG, STEPS, BATCH = 0.2, 0.005, 2e5, 24, 50
+LENGTH, RADIUS, YOUNG, STEPS, BATCH = 0.2, 0.005, 2e5, 24, 100
 
 
 def drawn(rng: np.random.Generator, count: int) -> dict[str, Any]:

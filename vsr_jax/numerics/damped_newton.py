@@ -43,6 +43,10 @@ without an evaluation after it: what it leaves is then known from the contractio
 _CUTS = 5
 """Number of times that a step which does not lower the residual is halved where something slides
 with friction."""
+_FIRST_STAGES = 80
+"""Bound on the evaluations of the first careful attempt where there are stages."""
+_SLOW_DAMPING, _HARDER = 100.0, 0.25
+"""Damping with which the second one begins, and by how much of a stage its springs are harder."""
 _SLIDING = 20
 """Bound on the evaluations of a first attempt where something slides with friction."""
 _SETTLED = 0.3
@@ -151,6 +155,7 @@ def damped_newton(
     - Stages. The stages of constraints without an energy accept every finite step, undamped; one
       that goes back by half of the last one is halved. Where the constraints hold by a wide margin,
       the last stage follows at once.
+      A problem that ends without a stable root begins once more, slowly, with harder springs.
     - Friction. What `slides` has no energy: its steps are accepted where the residual becomes
       smaller, else halved, some times. Its first attempt has at most `_SLIDING` evaluations.
     - Probing. Where the tangent is doubtful at the end, the arm is moved from the solution by the
@@ -247,20 +252,28 @@ def damped_newton(
             lambda a, s: a - jnp.where(last, s, 0.0).astype(a.dtype), trial, new.step
         )
         x = select(go & taken, finished, x)
-        if not twice:
+        if not (twice or stages):
             return x, new_step, earlier, guard
         failed = jnp.where(go, ~(taken & new.definite), old.definite & ~guard.definite)
         if cut is not None:
             failed = (failed & ~(go & cut)) | (go & (old.spent >= _SLIDING))
+        if not twice:
+            sound = guard.definite & (guard.merit <= accepted)
+            ended = ~(going(guard) | probing(guard))
+            failed = (ended & ~sound) | (guard.spent >= _FIRST_STAGES)
         again = ~old.gradual & failed
-        guard = select(again, careful._replace(gradual=~careful.gradual, spent=guard.spent), guard)
+        guard = select(again, second._replace(spent=guard.spent), guard)
         new_step = jax.tree.map(lambda s: jnp.where(again, 0.0, s).astype(s.dtype), new_step)
         return select(again, origin, x), new_step, earlier, guard
 
     careful = first = _careful(floor, increments)
+    second = careful._replace(gradual=~careful.gradual)
     if twice:
         whole = jnp.full_like(floor, levels)
         first = careful._replace(applied=whole, damping=jnp.zeros_like(floor))
+    else:
+        slow = jnp.full_like(floor, _SLOW_DAMPING)
+        second = second._replace(applied=second.applied + _HARDER, damping=slow)
 
     def begin(like: tuple | None) -> tuple:
         step = jax.eval_shape(evaluate, start, floor, floor).step if like is None else like[1]
