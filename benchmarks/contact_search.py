@@ -1,7 +1,7 @@
 """Random arms among or inside obstacles: how many are solved, and how well.
 
     python benchmarks/contact_search.py [--draws 1000] [--obstacles 1 3 10] [--json FILE]
-    python benchmarks/contact_search.py --tubes 100 [--json FILE]
+    python benchmarks/contact_search.py --tubes 100 [--steps 24] [--json FILE]
 
 The first form: arms with gravity, a force at the tip and some spheres that do not touch the arm at
 rest. The second: arms in straight tubes, in tubes bent in space, and in such tubes of varying
@@ -31,12 +31,12 @@ from vsr_jax.arm.tube import curve_through
 
 jax.config.update("jax_enable_x64", True)
 
-LENGTH, RADIUS, YOUNG, STEPS, BATCH = 0.2, 0.005, 2e5, 24, 50
+LENGTH, RADIUS, YOUNG, BATCH = 0.2, 0.005, 2e5, 50
 TUBES = {"straight": "a straight tube", "bent": "a bent tube", "varying": "a bent tube that varies"}
 LOADS = ("force", "gravity", "tendons")
 BEND, PIECES = 1.6, 5
-"""Largest angle [rad] between the ends of a bent tube's line in each direction, about the size of
-that of measured vessels, and number of pieces between its points."""
+"""Angle [rad] by which the line of a bent tube turns at most, in each of two directions, and the
+number of pieces between its points."""
 
 
 def drawn(rng: np.random.Generator, count: int) -> dict[str, Any]:
@@ -89,7 +89,7 @@ def in_tube(numbers: dict[str, jax.Array]) -> tuple[vsr.Scene, jax.Array]:
     """Scene and inputs of one arm in a tube, whose base is in the middle and along it."""
     width, line = numbers["radii"], numbers["line"]
     tube = vsr.Tube(vsr.Taper(width[0], width[1]), line)
-    ahead = curve_through(tube.line, tube.radius).at(jnp.zeros(()))[1]
+    ahead = curve_through(line, tube.radius).at(jnp.zeros(()))[1]
     loads = [vsr.Gravity(numbers["gravity"]), vsr.TipWrench(numbers["force"])]
     tendons = [vsr.Tendon(vsr.Parallel(y, z)) for y, z in ((0.003, 0.0), (0.0, 0.003))]
     rod = _rod(numbers["density"], vsr.pose(line[0], pointing=ahead))
@@ -101,10 +101,10 @@ def _rod(density: jax.Array, base: jax.Array | None = None) -> vsr.Rod:
     return vsr.Rod(length=LENGTH, section=vsr.Circular(radius=RADIUS), material=material, base=base)
 
 
-def solved(scene_of: Callable, numbers: dict[str, jax.Array]) -> dict[str, jax.Array]:
+def solved(scene_of: Callable, steps: int, numbers: dict[str, jax.Array]) -> dict[str, jax.Array]:
     """What is compared of one arm."""
     scene, inputs = scene_of(numbers)
-    eq = vsr.solve(scene, inputs, model=vsr.StrainDependent(STEPS))
+    eq = vsr.solve(scene, inputs, model=vsr.StrainDependent(steps))
     X = jnp.linspace(0.0, LENGTH, 401)
     positions = eq.position(X)
     gaps = [jnp.min(jax.vmap(o.distance)(positions)) - RADIUS for o in scene.obstacles]
@@ -125,9 +125,11 @@ def solved(scene_of: Callable, numbers: dict[str, jax.Array]) -> dict[str, jax.A
     }
 
 
-def in_batches(scene_of: Callable, draws: list[dict[str, Any]]) -> dict[str, np.ndarray]:
+def in_batches(
+    scene_of: Callable, steps: int, draws: list[dict[str, Any]]
+) -> dict[str, np.ndarray]:
     """What is compared of all arms."""
-    program, found = jax.jit(jax.vmap(partial(solved, scene_of))), []
+    program, found = jax.jit(jax.vmap(partial(solved, scene_of, steps))), []
     for first in range(0, len(draws), BATCH):
         part = jax.tree.map(lambda *x: np.stack(x), *draws[first : first + BATCH])
         found.append(jax.tree.map(np.asarray, program(part)))
@@ -158,13 +160,13 @@ def summary(result: dict[str, np.ndarray], seconds: float) -> dict[str, Any]:
     }
 
 
-def tubes(arms: int) -> dict[str, Any]:
+def tubes(arms: int, steps: int) -> dict[str, Any]:
     """The records of arms in tubes, for each kind of tube."""
     record = {}
     for i, kind in enumerate(TUBES):
         rng, begin = np.random.default_rng(i), time.perf_counter()
         draws = [drawn_tube(rng, kind) for _ in range(arms)]
-        result = in_batches(in_tube, draws)
+        result = in_batches(in_tube, steps, draws)
         record[kind] = summary(result, time.perf_counter() - begin)
         load = np.array([draw["load"] for draw in draws])
         record[kind]["loads"] = {
@@ -174,14 +176,13 @@ def tubes(arms: int) -> dict[str, Any]:
     return record
 
 
-def spheres(arms: int, counts: list[int]) -> dict[int, Any]:
+def spheres(arms: int, counts: list[int], steps: int) -> dict[int, Any]:
     """The records of arms among spheres, for each number of them."""
     record = {}
     for count in counts:
         rng, begin = np.random.default_rng(count), time.perf_counter()
-        result = in_batches(
-            partial(among_spheres, count), [drawn(rng, count) for _ in range(arms)]
-        )
+        draws = [drawn(rng, count) for _ in range(arms)]
+        result = in_batches(partial(among_spheres, count), steps, draws)
         record[count] = summary(result, time.perf_counter() - begin)
         print(count, json.dumps(record[count], indent=1), flush=True)
     return record
@@ -195,12 +196,13 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=1000)
     parser.add_argument("--obstacles", type=int, nargs="+", default=[1, 3, 10])
     parser.add_argument("--tubes", type=int, help="arms in each kind of tube, in place of spheres")
+    parser.add_argument("--steps", type=int, default=24, help="steps of the grid along the arm")
     parser.add_argument("--json")
     options = parser.parse_args()
     if options.tubes:
-        record = tubes(options.tubes)
+        record = tubes(options.tubes, options.steps)
     else:
-        record = spheres(options.draws, options.obstacles)
+        record = spheres(options.draws, options.obstacles, options.steps)
     if options.json:
         with open(options.json, "w", encoding="utf-8") as file:
             json.dump(record, file, indent=1)
