@@ -151,11 +151,11 @@ def summary(result: dict[str, np.ndarray], seconds: float) -> dict[str, Any]:
         "solved": int(np.sum(good)),
         "statuses": statuses(result["status"]),
         "touching": int(np.sum(touching)),
-        "steps_median": float(np.median(result["steps"][touching])),
+        "steps_median": float(np.median(result["steps"][touching])) if touching.any() else None,
         "steps_largest": int(np.max(result["steps"][touching], initial=0)),
-        "penetration_of_radius": float(np.max(-result["gap"][good]) / RADIUS),
-        "min_of_gap_and_force": float(np.max(result["product"][good])),
-        "imbalance_N": float(np.max(result["imbalance"][good])),
+        "penetration_of_radius": float(np.max(-result["gap"][good], initial=0.0) / RADIUS),
+        "min_of_gap_and_force": float(np.max(result["product"][good], initial=0.0)),
+        "imbalance_N": float(np.max(result["imbalance"][good], initial=0.0)),
         "seconds": seconds,
     }
 
