@@ -74,3 +74,67 @@ def test_a_heavy_arm_snakes_in_a_tube_at_its_critical_thrust(weight, clearance):
         margins.append(float(eq.stability))
     vanishes = shares[1] + margins[1] * (shares[1] - shares[0]) / (margins[0] - margins[1])
     np.testing.assert_allclose(vanishes, 1, atol=5e-4)
+
+
+CLEARANCE, WEIGHT = 0.002, 100.0
+TOUCHING = 4 * np.pi**2
+"""Thrust at which an arm with clamped ends buckles, and touches where the clearance is small."""
+
+
+def aside(thrust, weight, start=None):
+    """The equilibrium of an arm in the middle of the tube at both ends, under a thrust and a load
+    of weight times the clearance."""
+    end = vsr.Held(position=(L, 0, 0), orientation=np.eye(3), along=(1, 0, 0))
+    down = jnp.array([0.0, 0.0, -1.0]) * weight * CLEARANCE * FORCE / L
+    push = jnp.array([-1.0, 0.0, 0.0]) * thrust * FORCE
+    scene = vsr.Scene(
+        vsr.Rod(L, vsr.Circular(RADIUS), vsr.Material(YOUNG, poisson=0.4)),
+        loads=[vsr.DistributedWrench(force=down), vsr.TipWrench(force=push)],
+        held=end,
+        obstacles=vsr.Tube(CLEARANCE + RADIUS),
+        free_strains=("torsion", "bending_y", "bending_z"),
+    )
+    return vsr.solve(scene, jnp.zeros(0), model=vsr.StrainDependent(25), start=start)
+
+
+def small_deflections(thrust, weight):
+    r"""Deflection at the abscissas and force of the contact in the middle, per clearance: $w'''' +
+    F w'' = q$ with $w = a (1 - \cos kX) + b (kX - \sin kX) + q X^2 / (2 F)$, $k^2 = F$, and $w = 1,
+    w' = 0$ at l = L / 2. The shear there is $w''' + F w' = k^3 b + q l$ on both sides. The force is
+    $2 k^3 / (kl - 2 \tan(kl / 2)) + q l$."""
+    k, half = np.sqrt(thrust), 0.5
+    rows = [
+        [1 - np.cos(k * half), k * half - np.sin(k * half)],
+        [k * np.sin(k * half), k * (1 - np.cos(k * half))],
+    ]
+    rest = [1 - weight * half**2 / (2 * thrust), -weight * half / thrust]
+    a, b = np.linalg.solve(rows, rest)
+
+    def deflection(X):
+        return a * (1 - np.cos(k * X)) + b * (k * X - np.sin(k * X)) + weight * X**2 / (2 * thrust)
+
+    return deflection, 2 * (k**3 * b + weight * half)
+
+
+@pytest.mark.slow
+def test_an_arm_that_has_buckled_in_a_tube():
+    """Shape, contact force and stability between the thrust at which an arm buckles and the one at
+    which it leaves its plane: half of it is then a column with one end clamped and one pinned, by
+    the contact, which the tube lets slide aside. A large load selects the side; a small one, which
+    makes the position around the tube unique, remains."""
+    leaves = 4 * 20.190728556426629
+    eq = aside(1.05 * TOUCHING, 10 * WEIGHT)
+    X = np.linspace(0, L, 21)
+    for share in (1.05, 1.2, 1.4, 1.7, 1.9, 2.0):
+        eq = aside(share * TOUCHING, WEIGHT, eq)
+        assert bool(eq.converged)
+        deflection, force = small_deflections(share * TOUCHING, WEIGHT)
+        expected = CLEARANCE * deflection(np.minimum(X, L - X))
+        np.testing.assert_allclose(-eq.position(X)[:, 2], expected, atol=5e-5 * CLEARANCE)
+        np.testing.assert_allclose(eq.position(X)[:, 1], 0, atol=1e-8 * L)
+        pressed = float(eq.contacts.force.sum()) / (CLEARANCE * FORCE)
+        np.testing.assert_allclose(pressed, force, rtol=5e-5)
+        if share >= 1.9:
+            margin = 1 - share * TOUCHING / leaves
+            np.testing.assert_allclose(eq.stability, margin, atol=2e-4)
+    assert int(aside(1.01 * leaves, WEIGHT, eq).status) == vsr.Status.UNSTABLE
