@@ -60,6 +60,18 @@ def test_the_margin_of_a_held_column_vanishes_at_its_buckling_load(orientation, 
     np.testing.assert_allclose(eq.stability, 0.5, atol=1e-7)
 
 
+@pytest.mark.parametrize("free", [("bending_y",), ("bending_y", "elongation")])
+def test_an_arm_in_a_plane_may_be_held_across_it(free):
+    """Clamped at one end, in a slide at the other: it sags by F L^3 / (192 EI) in the middle."""
+    held = vsr.Held(position=(L, 0, 0), orientation=np.eye(3), along=(1, 0, 0))
+    load = vsr.PointWrench(L / 2, force=(0, 0, -1e-4))
+    eq = solved(load, held=held, arm=rod(density=0.0), free_strains=free)
+    assert eq.status == vsr.Status.CONVERGED
+    sag = -1e-4 * L**3 / (192 * stiffness())
+    np.testing.assert_allclose(eq.position(L / 2)[2], sag, rtol=1e-4)
+    np.testing.assert_allclose(eq.supports[0, 5], 5e-5, rtol=1e-4)
+
+
 def test_a_clamped_elastica_has_the_force_of_the_elliptic_integrals():
     """Both ends clamped, brought to 0.8 L: four quarter waves, 2 E / K - 1 = 0.8 and
     P = (4 K)^2 EI / L^2."""

@@ -266,7 +266,7 @@ def _iteration(
         ),
         start,
         floor,
-        1 if whole.loads is None or whole.softens else LOAD_INCREMENTS,
+        1 if whole.loads is None or whole.begins_soft else LOAD_INCREMENTS,
         None if guess is None else origin,
         stages=HARDENING_STAGES if whole.softens else 0,
     )

@@ -100,6 +100,7 @@ class Contacts(Coupling):
     soft: Array | None = None
     traces: Traces | None = None
     softens = True
+    begins_soft = True
 
     def relaxed(self) -> "Contacts":
         obstacles, rod = finite((self.obstacles, self.rod))

@@ -40,6 +40,10 @@ SOFTENED = (SOFT_STAGES - 0.5) / HARDENING_STAGES
 HARDENED = 1 - 0.5 / HARDENING_STAGES
 """Hardness from which constraints are exact, but for the rounding of the last stage."""
 
+_IDLE = 0.75
+"""Power of the machine epsilon below which a row of the Schur complement is taken to be zero, as of
+a section held in a direction in which the arm cannot move."""
+
 Shares = tuple[Array | None, ...]
 """Share of each thread's force at the nodes; None for 1."""
 
@@ -97,6 +101,11 @@ class ArmProblem(NamedTuple):
     def softens(self) -> bool:
         """Whether a coupling is a constraint that springs can replace on the way to a solution."""
         return any(coupling.softens for coupling in self.couplings)
+
+    @property
+    def begins_soft(self) -> bool:
+        """Whether a solve from rest begins with springs in place of a constraint."""
+        return any(coupling.begins_soft for coupling in self.couplings)
 
     @property
     def dissipates(self) -> Array | None:
@@ -209,6 +218,10 @@ class Coupling(eqx.Module):
 
     softens: ClassVar[bool] = False
     """Whether it is a constraint on the shape that springs can replace on the way to a solution."""
+
+    begins_soft: ClassVar[bool] = False
+    """Whether a solve from rest does so from the beginning: the exact constraint seldom leads from
+    there to a solution."""
 
     @abstractmethod
     def relaxed(self) -> "Coupling":
@@ -401,7 +414,9 @@ def bordered_solve(
     given = work(border.rows, strain)
     unit = jnp.eye(size, dtype=right.dtype).reshape(size, size, *(1,) * (right.ndim - 1))
     pulled = work(tuple(row[:, None] for row in border.rows), answers)
-    factors = lu.factor(unit * border.corner[:, None] - border.factors[:, None] * pulled)
+    schur = unit * border.corner[:, None] - border.factors[:, None] * pulled
+    idle = jnp.max(jnp.abs(schur), axis=1) < jnp.finfo(schur.dtype).eps ** _IDLE
+    factors = lu.factor(schur + unit * idle[:, None])
     x = lu.substitute(factors, right - border.factors * given)
     strain = tuple(
         a - jnp.sum(x[:, None, None] * answer, axis=0)
