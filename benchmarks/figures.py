@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.patches import Circle
 
 import vsr_jax as vsr
 from benchmarks.designs import arm as wire, s_curve
@@ -142,7 +143,7 @@ def finger() -> Any:
     tensions = np.concatenate([up, up[-2:7:-1]])
     shown = {1.2: ink(0.4), 3.0: colors[2], 4.8: colors[0], 7.2: colors[1]}
     smooth, held = (_pressed(file.scene, mu, tensions) for mu in (0.0, 0.7))
-    left.add_patch(plt.Circle((36.0, -60.0), 20.0, color=mixed(ink(0.0), colors[5], 0.35)))
+    left.add_patch(Circle((36.0, -60.0), 20.0, color=mixed(ink(0.0), colors[5], 0.35)))
     for tension, color in shown.items():
         i = int(np.argmin(np.abs(up - tension)))
         outline = 1e3 * _outline(held.axis[i][:, [0, 2]], 0.006)
@@ -179,10 +180,10 @@ class _Held(NamedTuple):
     """A finger at several tensions: points of its axis, the force that it presses with, the point
     of its surface where most of it acts, and the force on it, with friction."""
 
-    axis: np.ndarray
-    pressed: np.ndarray
-    points: np.ndarray
-    forces: np.ndarray
+    axis: Any
+    pressed: Any
+    points: Any
+    forces: Any
 
 
 def _pressed(scene: vsr.Scene, friction: float, tensions: np.ndarray) -> _Held:
