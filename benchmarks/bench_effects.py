@@ -3,9 +3,9 @@ a batch of 1,024.
 
     python benchmarks/bench_effects.py [--json FILE] [--rounds N]
 
-One arm with two tendons to which the effects are added one after another
-(`vsr_jax.studies.effects`), float64, all solves timed in turn in one run. `vsr-jax effects` prints
-the same table for a smaller batch.
+One arm with two tendons to which effects are added one after another, then others one by one to the
+arm under gravity (`vsr_jax.studies.effects`), float64, all solves timed in turn in one run.
+`vsr-jax effects` prints the same table for a smaller batch.
 """
 
 import argparse
@@ -31,7 +31,7 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     print(
         f"{machine()}, jax {jax.__version__}; 16 steps of order 6, {BATCH} in a batch; median (10 "
-        f"%-90 %), x: relative to the row above"
+        f"%-90 %), x: relative to the row above, or to that in brackets"
     )
     costs = effects.measure(BATCH, options.rounds)
     print("\n".join(effects.table(costs)))

@@ -9,13 +9,14 @@
 import argparse
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.patches import Circle
 
 import vsr_jax as vsr
 from benchmarks.designs import arm as wire, s_curve
@@ -23,6 +24,7 @@ from vsr_jax import annotate, plot, plot_design
 from vsr_jax.arm.placement import Direction
 from vsr_jax.optimization.descent import History
 from vsr_jax.viz.space import equal_scale, fill, world_frame
+from vsr_jax.viz.style import ink, mixed
 
 FOLDER = Path(__file__).parents[1]
 MODEL = vsr.StrainDependent(12)
@@ -132,6 +134,83 @@ def frame() -> Any:
     return figure
 
 
+def finger() -> Any:
+    """The finger of `notebooks/scenes/finger.toml`: shapes with the forces of the ball, and the
+    force that it presses with while it closes and opens."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9.0, 3.9), width_ratios=(1.15, 1.0))
+    file, colors = vsr.load(FOLDER / "notebooks/scenes/finger.toml"), plot.COLORS
+    up = np.arange(0.3, 7.3, 0.3)
+    tensions = np.concatenate([up, up[-2:7:-1]])
+    shown = {1.2: ink(0.4), 3.0: colors[2], 4.8: colors[0], 7.2: colors[1]}
+    smooth, held = (_pressed(file.scene, mu, tensions) for mu in (0.0, 0.7))
+    left.add_patch(Circle((36.0, -60.0), 20.0, color=mixed(ink(0.0), colors[5], 0.35)))
+    for tension, color in shown.items():
+        i = int(np.argmin(np.abs(up - tension)))
+        outline = 1e3 * _outline(held.axis[i][:, [0, 2]], 0.006)
+        left.fill(*outline.T, facecolor=(color, 0.12), edgecolor=color)
+        start, force = 1e3 * held.points[i][[0, 2]], _PER_NEWTON * held.forces[i][[0, 2]]
+        if held.pressed[i] > 0.01:
+            left.quiver(*start, *force, color=color, **_ARROW)
+        left.plot([], [], color=color, label=f"{tension:.1f} N")
+    left.legend(title="tension", loc="upper right")
+    left.set(aspect="equal", xlabel="x [mm]", ylabel="z [mm]", xlim=(-4, 116), ylim=(-84, 10))
+    turn = up.size
+    right.plot(up, held.pressed[:turn], color=colors[1], marker=".", label="closing")
+    right.plot(
+        tensions[turn - 1 :], held.pressed[turn - 1 :], color=colors[0], marker=".", label="opening"
+    )
+    lost = int(np.argmin(np.isfinite(smooth.pressed)))
+    right.plot(up[:lost], smooth.pressed[:lost], color=ink(0.5), label="without friction")
+    right.plot(up[lost - 1], smooth.pressed[lost - 1], "x", color=ink(0.5))
+    right.annotate("slips off", (up[lost - 1], smooth.pressed[lost - 1]), (6, -4), **_OFFSET)
+    right.set(xlabel="tension [N]", ylabel="force on the ball [N]")
+    right.legend()
+    figure.tight_layout()
+    return figure
+
+
+_OFFSET: dict[str, Any] = {"textcoords": "offset points", "va": "top"}
+_PER_NEWTON = 60.0
+"""Length of an arrow [mm/N]."""
+_ARROW: dict[str, Any] = {"angles": "xy", "scale_units": "xy", "scale": 1.0, "zorder": 5}
+_ARROW |= {"units": "xy", "width": 1.4}
+
+
+class _Held(NamedTuple):
+    """A finger at several tensions: points of its axis, the force that it presses with, the point
+    of its surface where most of it acts, and the force on it, with friction."""
+
+    axis: Any
+    pressed: Any
+    points: Any
+    forces: Any
+
+
+def _pressed(scene: vsr.Scene, friction: float, tensions: np.ndarray) -> _Held:
+    scene = scene.replace("obstacles[0].friction", friction)
+
+    def seen(eq: vsr.Equilibrium) -> _Held:
+        one = jax.tree.map(lambda x: x[0], eq.contacts)
+        most = one.position - 0.006 * one.normal
+        forces = one.force[:, None] * one.normal + one.friction
+        axis = eq.position(jnp.linspace(0.0, 0.1, 81))
+        place = most[jnp.argmax(one.force)]
+        return _Held(axis, one.force.sum(), place, forces.sum(0))
+
+    path = vsr.follow(scene, jnp.asarray(tensions)[:, None], model=MODEL)
+    return jax.tree.map(np.asarray, jax.jit(jax.vmap(seen))(path))
+
+
+def _outline(axis: np.ndarray, radius: float) -> np.ndarray:
+    """Outline of a round-ended finger in a plane, from points of its axis (points, 2)."""
+    along = np.gradient(axis, axis=0)
+    across = np.stack([-along[:, 1], along[:, 0]], 1) / np.linalg.norm(along, axis=1)[:, None]
+    turn = np.linspace(0.0, np.pi, 15)[:, None]
+    end, side = along[-1] / np.linalg.norm(along[-1]), across[-1]
+    cap = axis[-1] + radius * (np.cos(turn) * side + np.sin(turn) * end)
+    return np.concatenate([axis + radius * across, cap, (axis - radius * across)[::-1]])
+
+
 FIGURES: dict[str, Callable[[], Any]] = {
     function.__name__: function
     for function in (
@@ -144,6 +223,7 @@ FIGURES: dict[str, Callable[[], Any]] = {
         workspace_by_tension,
         design,
         frame,
+        finger,
     )
 }
 """Functions that draw a figure, by name."""

@@ -2,6 +2,7 @@
 
 import itertools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from vsr_jax.studies.timing import Timed, take_turns
 
 
 def test_every_scene_adds_one_effect():
-    scenes = effects.scenes()
+    scenes = effects.added_scenes()
     added = [
         [name for name in b.scene.effects if name not in a.scene.effects]
         for a, b in itertools.pairwise(scenes)
@@ -33,6 +34,30 @@ def test_every_scene_adds_one_effect():
     ]
     assert [len(one.scene.breakpoints) for one in scenes[4:6]] == [1, 3]
     assert [one.pose for one in scenes] == [False] + [True] * 9
+
+
+def test_other_scenes_add_one_effect_to_the_scene_that_they_name():
+    named = {one.name: one for one in effects.scenes()}
+    assert len(named) == len(effects.scenes())
+    added = []
+    for one in effects.single_scenes():
+        assert one.base is not None
+        base = named[one.base]
+        assert one.inputs == base.inputs
+        added.append([x for x in one.scene.effects if x not in base.scene.effects])
+        if one.followed and base.followed:  # friction is a number of the obstacle
+            assert base.scene.obstacles[0].friction is None
+            assert one.scene.replace("obstacles[0].friction", 0.1).obstacles[0].friction == 0.1
+    assert added == [
+        ["sections", "discs"],
+        ["sections", "rigid pieces"],
+        ["held section"],
+        ["cylinder"],
+        ["cylinder"],
+        [],
+        [],
+    ]
+    assert [one.followed for one in effects.single_scenes()] == [False] * 5 + [True] * 2
 
 
 def test_timed_measures_operations_and_times():
@@ -56,11 +81,16 @@ def test_table_compares_each_row_with_the_one_above():
         }
         return effects.Cost(name, (), operations, summary, summary, 10, 1.0)
 
-    lines = effects.table([cost("bare", 1000, 40.0), cost("+ load", 3000, 60.0)])
+    costs = [cost("bare", 1000, 40.0), cost("+ load", 3000, 60.0), cost("held", 1500, 80.0)]
+    lines = effects.table([*costs[:2], costs[2]._replace(base="bare")])
     assert lines[2] == "| bare | 1,000 | 2.0 | 40 (40-40) | 4 (4-4) | 100 % |"
     assert (
         lines[3]
         == "| + load | 3,000, x 3 | 2.0, x 1 | 60 (60-60), x 1.5 | 6 (6-6), x 1.5 | 100 % |"
+    )
+    assert (
+        lines[4]
+        == "| held (over bare) | 1,500, x 1.5 | 2.0, x 1 | 80 (80-80), x 2 | 8 (8-8), x 2 | 100 % |"
     )
 
 
@@ -77,4 +107,28 @@ def test_all_scenes_are_measured():
     assert all(cost.converged == 1 for cost in costs)
     operations = [cost.operations for cost in costs]
     assert operations[2] > operations[1]
-    assert operations[-1] > operations[2]
+    assert operations[9] > operations[2]
+    named = {cost.name: cost.operations for cost in costs}
+    for cost in costs[13:]:  # those with an obstacle
+        assert cost.operations > named[cost.base]
+
+
+@pytest.mark.slow
+def test_the_arm_lies_on_one_pillar_and_not_on_the_other():
+    """For the smallest and the largest inputs of a batch; friction acts along the path."""
+    named = {one.name: one for one in effects.single_scenes()}
+
+    def pressed(name, share):
+        one = named[name]
+        inputs = share * np.outer([0.5, 1.0], one.inputs)
+        path = jax.jit(lambda u: vsr.follow(one.scene, u, model=vsr.StrainDependent(8)))(inputs)
+        contacts = jax.vmap(lambda eq: eq.contacts)(path)
+        return np.sum(contacts.force, (1, 2)), np.linalg.norm(np.sum(contacts.friction, (1, 2)))
+
+    for share in (0.5, 1.5):
+        np.testing.assert_allclose(pressed("pillar, not touched", share)[0], 0.0, atol=1e-9)
+        smooth = pressed(f"touched, path of {effects.SAMPLES}", share)
+        rough = pressed("+ friction of contact", share)
+        assert np.all(smooth[0] > 0.1)
+        assert smooth[1] == 0.0
+        assert rough[1] > 0.01

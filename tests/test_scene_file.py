@@ -159,7 +159,7 @@ def test_examples_converge(path):
 
 def test_there_are_examples():
     stems = {path.stem for path in EXAMPLES}
-    assert stems == {"helix", "catheter", "pneumatic", "payload", "pillar", "vessel"}
+    assert stems == {"helix", "catheter", "finger", "pneumatic", "payload", "pillar", "vessel"}
 
 
 class Zigzag(vsr.Parallel):

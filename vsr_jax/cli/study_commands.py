@@ -56,10 +56,13 @@ def add_effects(commands: Commands) -> None:
         "effects",
         description="Adds effects to one arm, one at a time: poses, gravity, a tip wrench, a "
         "follower load, a second section,\n"
-        "a tendon driven by its length, friction. Prints the operations of the compiled program "
-        "(each loop body counted\n"
-        "once), the compile time and the time per solve, single and in a batch, with ratios to "
-        "the row above. Takes a few minutes.",
+        "a tendon driven by its length, friction, a payload, a spring; then each alone to the arm "
+        "under gravity: straight\n"
+        "tendons, a rigid piece, a held tip, an obstacle, friction of contact. Prints the "
+        "operations of the compiled program\n"
+        "(each loop body counted once), the compile time and the time per solve, single and in a "
+        "batch, with ratios to the row\n"
+        "above or in brackets. Takes ten minutes.",
         example="vsr-jax effects --batch-size 64 --json effects.json",
         run=_effects,
     )

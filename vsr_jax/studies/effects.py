@@ -1,4 +1,5 @@
-"""Cost of each effect of a scene: effects are added to one arm, one at a time."""
+"""Cost of each effect of a scene: effects are added to one arm, one after another, and others alone
+to the arm under gravity."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -9,11 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from ..analysis.following import follow
 from ..arm.actuator import Tendon
+from ..arm.held import Held
 from ..arm.loads import Gravity, PointWrench, TipWrench
 from ..arm.material import Material
+from ..arm.obstacles import Cylinder
+from ..arm.placement import pose
 from ..arm.pose_loads import Payload, Spring
 from ..arm.profile import Piecewise
+from ..arm.rigid_piece import RigidPiece
 from ..arm.rod import Rod
 from ..arm.routing import Helix, Parallel
 from ..arm.scene import Scene
@@ -28,19 +34,27 @@ PULLED, SHORTENED = (4.0, 2.0), (4.0, -0.003)
 second."""
 
 
+SAMPLES = 2
+"""Samples of a path of inputs."""
+
+
 class EffectScene(NamedTuple):
-    """A scene whose cost is measured: its name, the scene, the inputs, and whether the tip pose is
-    computed or only the strains."""
+    """A scene whose cost is measured: its name, the scene, the inputs, whether the tip pose is
+    computed or only the strains, whether the inputs are approached along a path of `SAMPLES`, and
+    the name of the scene to which the effect is added, by default the one before."""
 
     name: str
     scene: Scene
     inputs: tuple[float, float] = PULLED
     pose: bool = True
+    followed: bool = False
+    base: str | None = None
 
 
 class Cost(NamedTuple):
     """Cost of a scene: its effects, operations of the compiled single solve, summaries of
-    `Timed` for a single solve and for a batch, share of the batch that converged."""
+    `Timed` for a single solve and for a batch, share of the batch that converged, and the name of
+    the scene with which it is compared, by default the one before."""
 
     name: str
     effects: tuple[str, ...]
@@ -49,9 +63,15 @@ class Cost(NamedTuple):
     batch: dict[str, float]
     batch_size: int
     converged: float
+    base: str | None = None
 
 
 def scenes() -> list[EffectScene]:
+    """All scenes: the effects that are added to those before, then those that are added alone."""
+    return added_scenes() + single_scenes()
+
+
+def added_scenes() -> list[EffectScene]:
     """Tendons only, + poses, + gravity, + tip wrench, + follower, + second section, + length
     control, + friction, + payload, + spring."""
     soft, hard = 4.0e5, 8.0e5
@@ -88,6 +108,41 @@ def scenes() -> list[EffectScene]:
     ]
 
 
+def single_scenes() -> list[EffectScene]:
+    """The arm under gravity with straight tendons, a rigid piece, a tip that slides along a line, a
+    pillar that it does not touch, or one on which it lies; the last one along a path, without and
+    with friction."""
+    material = Material(8.0e5, poisson=0.45, density=1000.0)
+    arm = Rod(0.3, Circular(0.01), material)
+    tooled = Rod(0.3, Circular(0.01), material, rigid=[RigidPiece(0.25)])
+    paths, gravity = (Helix(0.007, 1.5), Parallel(0.0, 0.007)), Gravity((0.0, 0.0, -9.81))
+    tendons = [Tendon(path) for path in paths]
+    straight = [Tendon(path, discs=8) for path in paths]
+    guided = Held(position=(0.2, 0.0, -0.1), along=(1.0, 0.0, 0.0))
+    touched = Scene(arm, tendons, gravity, obstacles=_pillar(-0.035))
+    rough = Scene(arm, tendons, gravity, obstacles=_pillar(-0.035, friction=0.3))
+    on_path = f"touched, path of {SAMPLES}"
+    return [
+        EffectScene("straight tendons", Scene(arm, straight, gravity), base="+ gravity"),
+        EffectScene("rigid piece", Scene(tooled, tendons, gravity), base="+ gravity"),
+        EffectScene("held tip", Scene(arm, tendons, gravity, held=guided), base="+ gravity"),
+        EffectScene(
+            "pillar, not touched",
+            Scene(arm, tendons, gravity, obstacles=_pillar(0.2)),
+            base="+ gravity",
+        ),
+        EffectScene("pillar, touched", touched, base="+ gravity"),
+        EffectScene(on_path, touched, followed=True, base="pillar, touched"),
+        EffectScene("+ friction of contact", rough, followed=True, base=on_path),
+    ]
+
+
+def _pillar(height: float, *, friction: float | None = None) -> Cylinder:
+    """A pillar across the arm, whose axis is at a height [m] above the base."""
+    across = pose((0.1, 0.0, height), pointing=(0.0, 1.0, 0.0))
+    return Cylinder(0.02, pose=across, friction=friction)
+
+
 def measure(
     batch_size: int = 256,
     rounds: int = 5,
@@ -118,6 +173,7 @@ def measure(
                 batch.summary(),
                 batch_size,
                 share,
+                one.base,
             )
         )
     return costs
@@ -131,6 +187,10 @@ def _jobs(compared: EffectScene, model: StrainDependent, scale: np.ndarray) -> t
         if not compared.pose:
             outcome = model.solve(scene, inputs)
             return outcome.state.xi, outcome.status == Status.CONVERGED
+        if compared.followed:
+            share = jnp.arange(1, SAMPLES + 1)[:, None] / SAMPLES
+            path = follow(scene, share * inputs, model=model)
+            return jax.vmap(lambda eq: eq.tip)(path), jnp.all(path.status == Status.CONVERGED)
         eq = solve(scene, inputs, model=model)
         return eq.tip, eq.converged
 
@@ -141,14 +201,17 @@ def _jobs(compared: EffectScene, model: StrainDependent, scale: np.ndarray) -> t
 
 
 def table(costs: Sequence[Cost]) -> list[str]:
-    """Lines of a Markdown table; each number with its ratio to the row above."""
+    """Lines of a Markdown table; each number with its ratio to the row above, or to the row whose
+    name is in brackets."""
     lines = [
         "| scene | operations | compile [s] | single [us] | batch [us per shape] | converged |",
         "|" + "---|" * 6,
     ]
-    for above, cost in zip((None, *costs), costs, strict=False):
+    named = {cost.name: cost for cost in costs}
+    for before, cost in zip((None, *costs), costs, strict=False):
+        above = before if cost.base is None else named[cost.base]
         cells = [
-            cost.name,
+            cost.name if cost.base is None else f"{cost.name} (over {cost.base})",
             _cell(f"{cost.operations or 0:,}", cost.operations, above and above.operations),
             _cell(
                 f"{cost.single['compile_s']:.1f}",
