@@ -416,7 +416,7 @@ def bordered_solve(
     pulled = work(tuple(row[:, None] for row in border.rows), answers)
     schur = unit * border.corner[:, None] - border.factors[:, None] * pulled
     idle = jnp.max(jnp.abs(schur), axis=1) < jnp.finfo(schur.dtype).eps ** _IDLE
-    factors = lu.factor(schur + unit * idle[:, None])
+    factors = lu.factor(schur + jnp.where(idle[:, None], unit, 0.0))
     x = lu.substitute(factors, right - border.factors * given)
     strain = tuple(
         a - jnp.sum(x[:, None, None] * answer, axis=0)
