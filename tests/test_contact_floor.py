@@ -12,6 +12,7 @@ at the touch-down $\theta = \kappa = z = 0$, and the floor exerts a point force 
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -129,3 +130,26 @@ def test_a_low_arm_lifts_off_as_a_beam_of_small_slope():
     moment, force = np.asarray(eq.reaction(0.0)[1]) * L / EI, float(eq.reaction(0.0)[5]) / FORCE
     np.testing.assert_allclose(-force, 2 / 3 * weight * free, rtol=2e-3)
     np.testing.assert_allclose(moment, weight * free**2 / 6, rtol=2e-3)
+
+
+@pytest.mark.parametrize("density", [1200.0, pytest.param(700.0, marks=pytest.mark.slow)])
+def test_an_arm_that_lies_along_a_floor_is_differentiated(density):
+    """Half of the steps lie on the floor, where the place of a contact in its step is given by the
+    term in epsilon alone. The lighter arm is solved by a second attempt, with a larger one."""
+
+    def forces(density):
+        material = vsr.Material(young=2e5, poisson=0.4, density=density)
+        rod = vsr.Rod(0.2, section=vsr.Circular(0.005), material=material)
+        floor = vsr.Plane([0.0, 0.0, 1.0], [0.0, 0.0, -0.02])
+        scene = vsr.Scene(rod, loads=vsr.Gravity(), obstacles=floor)
+        eq = vsr.solve(scene, jnp.zeros(0), model=vsr.StrainDependent(24))
+        return jnp.sort(eq.contacts.force.reshape(-1))[-11:], eq.status
+
+    value, rate = jax.jit(jax.vmap(forces)), jax.jit(jax.jacfwd(lambda x: forces(x)[0]))
+    step = 1e-3 * density
+    found, status = value(density + step * jnp.array([-2.0, -1.0, 1.0, 2.0]))
+    assert np.all(status == vsr.Status.CONVERGED)
+    assert np.all(found > 0)
+    expected = (found[0] - found[3] + 8 * (found[2] - found[1])) / (12 * step)
+    exact = rate(density)
+    assert np.max(np.abs(exact - expected)) < 1e-6 * np.max(np.abs(expected))

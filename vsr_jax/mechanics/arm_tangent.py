@@ -26,8 +26,9 @@ from .springs import with_springs
 _REFINEMENTS = 60
 """Bound on the refinement steps of a tangent system; 5 to 10 are usual."""
 
-_KEPT = 8
-"""Number of earlier directions against which each new one is orthogonalised."""
+_KEPT, _KEPT_TOUCHING = 8, 48
+"""Number of earlier directions against which each new one is orthogonalised, and that with
+constraints: each contact of an arm that lies along a wall may have an inexact direction."""
 
 _FINAL, _ACCEPTED = 8.0, 1e4
 """Residual at which refinement ends, and largest accepted residual, in machine epsilons."""
@@ -140,11 +141,13 @@ def tangent_solve(
     _, forward = jax.linearize(scaled_nearly, jnp.zeros_like(b))
     back = jax.linear_transpose(forward, b)
 
+    kept = _KEPT_TOUCHING if problem.softens else _KEPT
+
     def solve(apply: Callable, b: Array) -> Array:
-        return _refined(apply, forward, b)
+        return _refined(apply, forward, b, kept)
 
     def transpose_solve(apply: Callable, b: Array) -> Array:
-        return _refined(apply, lambda r: back(r)[0], b)
+        return _refined(apply, lambda r: back(r)[0], b, kept)
 
     return unravel_change(
         to_change * lax.custom_linear_solve(scaled_apply, b, solve, transpose_solve)
@@ -185,9 +188,9 @@ class _Refinement(NamedTuple):
     found: Array
 
 
-def _refined(apply: Callable, nearly: Callable, right: Array) -> Array:
+def _refined(apply: Callable, nearly: Callable, right: Array, kept: int) -> Array:
     """Solution of a scaled system by the preconditioned generalised conjugate residual method,
-    where each direction is orthogonalised against the last few.
+    where each direction is orthogonalised against the last ones that are `kept`.
 
     For a soft motion of the arm the approximate tangent may be ten times too stiff. Plain iterative
     refinement would then take hundreds of steps; orthogonalisation finds such a motion at once. The
@@ -210,14 +213,14 @@ def _refined(apply: Callable, nearly: Callable, right: Array) -> Array:
         inverse = jnp.where(square > 0, 1 / jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
         p, q = inverse * p, inverse * q
         part = jnp.where(at.checking, 0.0, q @ at.r)
-        x, r, place, taken = at.x + part * p, at.r - part * q, at.taken % _KEPT, at.taken + 1
+        x, r, place, taken = at.x + part * p, at.r - part * q, at.taken % kept, at.taken + 1
         refined = ~(jnp.linalg.norm(r) > _FINAL * eps * whole(x)) | (taken >= _REFINEMENTS)
         directions, images = at.directions.at[place].set(p), at.images.at[place].set(q)
         return _Refinement(x, r, directions, images, taken, refined, at.checking, found)
 
-    kept, no = jnp.zeros((_KEPT, *right.shape), right.dtype), jnp.array(False)
+    none, no = jnp.zeros((kept, *right.shape), right.dtype), jnp.array(False)
     begin = _Refinement(
-        jnp.zeros_like(right), right, kept, kept, jnp.zeros((), int), ~(size > 0), no, no
+        jnp.zeros_like(right), right, none, none, jnp.zeros((), int), ~(size > 0), no, no
     )
     end = lax.while_loop(lambda at: ~at.done, advance, begin)
     return jnp.where(end.found, end.x, jnp.nan)  # no derivative rather than a wrong one

@@ -81,9 +81,10 @@ class Contacts(Coupling):
 
     **Fields:** the `obstacles`, the `rod` and the position of its `base`; the stiffness k, `scale`;
     `flatness` and `lift` of `Surroundings`; the length b, `blur`, and the compliance c, `give`, and
-    both to begin with, `first`; the number of `steps`; the coefficients of `friction`, None
-    without; `soft`: 1 where the gaps give the forces; `traces`: what the contacts remember where
-    the arm follows a path of inputs, None without.
+    both to begin with, `first`; `loose`: 1 where the flatness is that of a second attempt;
+    the number of `steps`; the coefficients of `friction`, None without; `soft`: 1 where the gaps
+    give the forces; `traces`: what the contacts remember where the arm follows a path of inputs,
+    None without.
     """
 
     obstacles: tuple[Obstacle, ...]
@@ -95,6 +96,7 @@ class Contacts(Coupling):
     blur: Array
     give: Array
     first: Array
+    loose: Array
     steps: int = eqx.field(static=True)
     friction: Array | None = None
     soft: Array | None = None
@@ -105,6 +107,12 @@ class Contacts(Coupling):
     def relaxed(self) -> "Contacts":
         obstacles, rod = finite((self.obstacles, self.rod))
         return replace(self, obstacles=obstacles, rod=rod, lift=self.lift + 1e3 * rod.length)
+
+    def loosened(self, again: Array) -> "Contacts":
+        return replace(self, loose=jnp.maximum(self.loose, again.astype(self.loose.dtype)))
+
+    def as_loose_as(self, other: Coupling) -> "Contacts":
+        return self.loosened(other.loose) if isinstance(other, Contacts) else self
 
     def softened(self, hardness: Array) -> "Contacts":
         of, length = self.scale.dtype, self.rod.length
@@ -150,7 +158,7 @@ class Contacts(Coupling):
             self.obstacles,
             self.rod,
             self.base,
-            self.flatness,
+            self._flatness(),
             self.lift,
             self.scale / self.give,
             2 * jnp.sqrt(self.give) * self.blur,
@@ -159,6 +167,12 @@ class Contacts(Coupling):
             self._rough(x),
         )
         return loads._replace(around=around)
+
+    def _flatness(self) -> Array:
+        """Bulge of a gap that counts as flat: in a second attempt that of the curvature 1 / L."""
+        bulge = self.rod.length / (8.0 * self.steps**2)
+        rough = jnp.maximum(self.flatness, bulge.astype(self.flatness.dtype))
+        return jnp.where(self.loose > 0, rough, self.flatness)
 
     def _forces(self, x: PyTree) -> Array:
         """The contact forces."""
@@ -184,9 +198,8 @@ class Contacts(Coupling):
 
     def remembering(self, other: Coupling, X: Array, grid: Grid) -> "Contacts":
         assert isinstance(other, Contacts)
-        if other.traces is None:
-            return self
-        return replace(self, traces=moved_to(other.traces, X, grid))
+        traces = None if other.traces is None else moved_to(other.traces, X, grid)
+        return replace(self.as_loose_as(other), traces=traces)
 
     def note(self, x: PyTree, at: ArmState, problem: ArmProblem) -> Touch:
         """The contacts."""
@@ -338,6 +351,7 @@ def contacts_of(scene: Scene, sections: CrossSections, grid: Grid) -> Contacts |
         _LAST[0] * length,
         jnp.full_like(length, _LAST[1]),
         _first(scene, length),
+        jnp.zeros_like(length),
         grid.h.shape[0],
         _friction(scene.obstacles, grid.h.dtype),
     )

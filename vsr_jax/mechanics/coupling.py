@@ -77,6 +77,19 @@ class ArmProblem(NamedTuple):
         couplings = tuple(coupling.softened(hardness) for coupling in self.couplings)
         return self._replace(loads=self.loads.scaled(jnp.minimum(share, 1.0)), couplings=couplings)
 
+    def loosened(self, again: Array | None) -> "ArmProblem":
+        """The problem that a second attempt solves, where `again` is true."""
+        if again is None or not self.softens:
+            return self
+        return self._replace(couplings=tuple(one.loosened(again) for one in self.couplings))
+
+    def as_loose_as(self, others: tuple["Coupling", ...]) -> "ArmProblem":
+        """The problem with its couplings loosened as those of one that it begins from."""
+        couplings = list(self.couplings)
+        for other in others:
+            couplings = [one.as_loose_as(other) for one in couplings]
+        return self._replace(couplings=tuple(couplings))
+
     def at_rest(self) -> "ArmProblem":
         """The problem without loads and forces and with relaxed couplings, so that its solution is
         the rest strain."""
@@ -238,6 +251,15 @@ class Coupling(eqx.Module):
     def softened(self, hardness: Array) -> "Coupling":
         """The coupling with springs in place of its constraint, from `hardness` 0 up to 1, where it
         is exact; the same by default."""
+        return self
+
+    def loosened(self, again: Array) -> "Coupling":
+        """The coupling where a first attempt has failed, with a rougher discretization where
+        `again` is true; the same by default."""
+        return self
+
+    def as_loose_as(self, other: "Coupling") -> "Coupling":
+        """The coupling, loosened where another one is that it begins from; the same by default."""
         return self
 
     def loads(self, x: PyTree, loads: Loading | None) -> Loading | None:

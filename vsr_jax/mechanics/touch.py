@@ -6,9 +6,14 @@ of the grid and for each obstacle the nearest point of the axis is found,
 $$\sigma = \arg\min_s \, d(r(s)) - \rho(s) + \epsilon (2 s - 1)^2, \quad 0 \le s \le 1,$$
 
 with the distance d to the obstacle and the polynomial r(s) through the step. The small $\epsilon$
-makes it unique where the arm lies along a surface, and is negligible where it does not; the least
-value is that which contact keeps from being negative, since its derivative is that of the gap at a
-given place. The contact force is $\lambda n$ with $n = \nabla d$, and friction as in `slip`.
+makes it unique where the arm lies along a surface; the least value is that which contact keeps from
+being negative, since its derivative is that of the gap at a given place. Where the gap has a clear
+minimum $\epsilon$ vanishes: with the bulge b of the gap over the step, its end values on average
+less the middle one, $\epsilon = \epsilon_0 \exp(-(b / \epsilon_0)^2)$ for b > 0. The sum is then
+convex in s at least as much as without bulge. $\epsilon_0$ is 1e-3 of the outline; where a first
+attempt to solve fails, it is the bulge $h^2 / (8 L)$ on a step of length h of a gap that curves by
+1 / L, with the length L of the arm. The contact force is $\lambda n$ with $n = \nabla d$, and
+friction as in `slip`.
 
 As an arm slides, its contact passes from step to step. Where the nearest point of a step is its
 end, and the step beyond has a nearest point of its own, that step receives the force.
@@ -42,7 +47,7 @@ _SAMPLES, _ITERATIONS = 5, 8
 class Surroundings(NamedTuple):
     r"""The obstacles around an arm.
 
-    **Fields:** the `obstacles`, the `rod` and the position of its `base`; `flatness` $\epsilon$
+    **Fields:** the `obstacles`, the `rod` and the position of its `base`; `flatness` $\epsilon_0$
     [m]; `lift` [m], added to all gaps; `stiffness` [N/m] and `width` [m] of penalties; `force` [N]
     of each obstacle on each step, shape (obstacles * steps, ...); `soft`: None, or 1 where
     penalties stand for the forces; `rough`: friction, None without.
@@ -331,11 +336,11 @@ class _Step(NamedTuple):
         return self.obstacle.distance(self.place(s)) - self.rod.outline(self.X + s * self.h)
 
     def lifted(self, s: Array) -> Array:
-        """Gap with the term in epsilon, much less where the gap has a clear minimum."""
+        """Gap with the term in epsilon."""
         first, middle, last = jax.vmap(self.gap)(jnp.array([0.0, 0.5, 1.0], self.h.dtype))
-        bulge = 8 * self.flatness
-        flat = bulge / (bulge + jnp.maximum(4 * (first + last - 2 * middle), 0.0))
-        return self.gap(s) + lax.stop_gradient(self.flatness * flat**3) * (2 * s - 1) ** 2
+        bulge = jnp.maximum(0.5 * (first + last) - middle, 0.0) / self.flatness
+        fading = self.flatness * jnp.exp(-(bulge**2))
+        return self.gap(s) + fading * (2 * s - 1) ** 2
 
     def slope(self, s: Array) -> Array:
         """Its derivative."""

@@ -276,7 +276,7 @@ def _solve(basis: NodalBasis, problem: ArmProblem) -> Root:
     size = K.shape[0]
     elastic = c.single(lu.diagonal(K))
 
-    def evaluate(unknown: GalerkinUnknown, damping: Array, share: Array) -> Damped:
+    def evaluate(unknown: GalerkinUnknown, damping: Array, share: Array, _: Array) -> Damped:
         part = problem.with_share(share)
         at = state_of(unknown, basis, part)
         r = imbalance(unknown, at, basis, part)

@@ -76,6 +76,8 @@ class StrainDependent(SteppedModel):
             return self.solve(scene, inputs)
         problem = problem_of(scene, inputs, self.grid(scene))
         guess = near.model.unknowns_on(near.scene, near.forces, near.state, problem)
+        if isinstance(near.state, ArmSolution):
+            problem = problem.as_loose_as(lax.stop_gradient(near.state.couplings))
         return self._solve_together(scene, problem, lax.stop_gradient(guess))
 
     def solve_after(self, scene: Scene, inputs: Float[Array, " inputs"], near: Near) -> Outcome:
@@ -114,7 +116,8 @@ class StrainDependent(SteppedModel):
     def _solve_together(
         self, scene: Scene, problem: ArmProblem, guess: ArmUnknown | None = None
     ) -> Outcome:
-        unknown, balanced, definite, steps = solve_arm(problem, scene.free, guess)
+        unknown, balanced, definite, steps, again = solve_arm(problem, scene.free, guess)
+        problem = problem.loosened(again)
         tau, sections = carried_forces(unknown, problem), problem.sections
         if problem.loads is not None and problem.loads.discs is not None:
             sections = problem.loads.discs.beside(sections)

@@ -125,7 +125,7 @@ class _Guard(NamedTuple):
 
 
 def damped_newton(
-    evaluate: Callable[[Any, Array, Array], Damped],
+    evaluate: Callable[[Any, Array, Array, Array], Damped],
     measures: Measures,
     start: Any,
     floor: Array,
@@ -174,7 +174,8 @@ def damped_newton(
     when it is done.
 
     **Arguments:**
-    - `evaluate`: maps a point, a damping $\mu$ and the fraction of the loads to `Damped`.
+    - `evaluate`: maps a point, a damping $\mu$, the fraction of the loads and whether this is a
+      second careful attempt, which may solve another problem, to `Damped`.
     - `measures`: of steps.
     - `floor`: size of the residual that counts as rounding, one entry per problem.
     - `increments`: number of load increments.
@@ -191,6 +192,9 @@ def damped_newton(
     levels = increments + stages
     small = float(jnp.finfo(floor.dtype).eps ** 0.75)
     accepted = jnp.maximum(_ACCEPTED * floor, small)
+
+    def once_more(guard: _Guard) -> Array:
+        return guard.gradual & (not twice)
 
     def going(guard: _Guard) -> Array:
         negligible = (guard.miss < small) | (guard.rises >= _MAX_RISES)
@@ -213,7 +217,7 @@ def damped_newton(
         share = jnp.minimum(applied / increments, 1.0)
         if stages:
             share = share + jnp.maximum(applied - increments, 0.0) / stages
-        new = evaluate(trial, jnp.where(probe, _PROBE_DAMPING, damping), share)
+        new = evaluate(trial, jnp.where(probe, _PROBE_DAMPING, damping), share, once_more(old))
         left = measures.work(new.residual, step)
         # the stages that are nearly exact have no energy
         hard = (old.gradual | (not twice)) & (applied >= increments + SOFT_STAGES)
@@ -276,7 +280,11 @@ def damped_newton(
         second = second._replace(applied=second.applied + _HARDER, damping=slow)
 
     def begin(like: tuple | None) -> tuple:
-        step = jax.eval_shape(evaluate, start, floor, floor).step if like is None else like[1]
+        step = (
+            jax.eval_shape(evaluate, start, floor, floor, first.fresh).step
+            if like is None
+            else like[1]
+        )
         step = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), step)
         return start, step, None if measures.dot is None else Earlier(step, step, step), first
 
@@ -285,7 +293,7 @@ def damped_newton(
 
     def root(state: tuple) -> Root:
         x, _, _, guard = state
-        return Root(x, guard.merit <= accepted, guard.definite, guard.spent)
+        return Root(x, guard.merit <= accepted, guard.definite, guard.spent, once_more(guard))
 
     return Iteration(begin, advance, busy, root)
 

@@ -20,6 +20,7 @@ def implicit_root(
     solve: Callable[..., Any],
     at_rest: Callable[..., tuple],
     *parameters: Any,
+    settle: Callable[..., tuple] = lambda found, *parameters: parameters,
 ) -> Root:
     r"""Root $x(p)$ of $r(x, p) = 0$ whose derivative is $dx = -(\partial r / \partial x)^{-1}
     (\partial r / \partial p) \, dp$.
@@ -36,6 +37,8 @@ def implicit_root(
     - `at_rest`: maps x and the parameters to the same with finite values of all that may have
       failed. A parameter that it returns unchanged costs no operation.
     - `parameters`: pytrees of arrays.
+    - `settle`: maps the root found and the parameters to those that it belongs to, if `find` may
+      choose between problems.
     """
 
     @jax.custom_jvp
@@ -51,16 +54,17 @@ def implicit_root(
         x = jax.tree.map(partial(jnp.where, sound), found.x, rest_x)
 
         def safe(parameters: tuple) -> tuple:
-            return jax.tree.map(
+            finite = jax.tree.map(
                 lambda replace, p, p_rest: jnp.where(sound, p, p_rest) if replace else p,
                 replaced,
                 parameters,
                 tuple(rest),
             )
+            return settle(found, *finite)
 
         right = change_of(lambda *p: residual(x, *safe(p)), primals, tangents)
         change = jax.tree.map(jnp.negative, solve(x, *safe(primals), right))
-        return found, Root(change, *no_derivative(found.converged, found.definite, found.steps))
+        return found, Root(change, *no_derivative(*found[1:]))
 
     return root(*parameters)
 
@@ -85,6 +89,6 @@ def change_of(function: Callable, primals: tuple, tangents: tuple) -> Any:
     return jax.jvp(moved, tuple(leaves[i] for i in moving), tuple(rates[i] for i in moving))[1]
 
 
-def no_derivative(*values: Array) -> tuple[Any, ...]:
+def no_derivative(*values: Array | None) -> tuple[Any, ...]:
     """Tangents of integer and boolean outputs."""
-    return tuple(np.zeros(value.shape, jax.dtypes.float0) for value in values)
+    return jax.tree.map(lambda value: np.zeros(value.shape, jax.dtypes.float0), values)

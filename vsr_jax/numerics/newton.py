@@ -42,12 +42,14 @@ class Iterate(NamedTuple):
 
 class Root(NamedTuple):
     """Result of a root search: the point, whether the residual vanishes there, whether the tangent
-    is positive definite there, and the number of evaluations."""
+    is positive definite there, the number of evaluations, and whether a later attempt found it,
+    where that solves another problem."""
 
     x: Any
     converged: Array
     definite: Array
     steps: Array
+    again: Array | None = None
 
 
 def newton(evaluate: Callable[[Any], Evaluation], start: Any, floor: Array) -> Iterate:
