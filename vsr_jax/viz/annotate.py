@@ -174,7 +174,9 @@ def wrenches_of(eq: Equilibrium) -> list[Acting]:
             found.append((pose, supports[i][None]))
     if eq.scene.obstacles:
         contacts = eq.contacts
+        touching = contacts.gap < _TOUCHING * rod.outline(contacts.X)
         pushes = contacts.force[..., None] * contacts.normal + contacts.friction
+        pushes = jnp.where(touching[..., None], pushes, 0.0)
         wrenches = jnp.concatenate([jnp.zeros_like(pushes), pushes], axis=-1)
         poses = jnp.zeros((*contacts.X.shape, 4, 4), wrenches.dtype)
         found += list(zip(poses.at[..., :3, 3].set(contacts.position), wrenches, strict=True))
@@ -197,8 +199,9 @@ def rows_from_wrenches(scene: Scene, wrenches: Sequence[Acting]) -> list[Row]:
     return found
 
 
-_SHOWN = 1e-6
-"""Share of the greatest wrench of a load above which it is drawn at a place."""
+_SHOWN, _TOUCHING = 1e-6, 0.1
+"""Share of the greatest wrench of a load above which it is drawn at a place, and gap, as a fraction
+of the outline, below which a contact is: farther away forces are rounding."""
 
 
 def _wrench(load: Load, rod: Rod, X: Array, poses: Array) -> Array:
