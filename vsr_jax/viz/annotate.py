@@ -174,7 +174,7 @@ def wrenches_of(eq: Equilibrium) -> list[Acting]:
             found.append((pose, supports[i][None]))
     if eq.scene.obstacles:
         contacts = eq.contacts
-        touching = contacts.gap < _TOUCHING * rod.outline(contacts.X)
+        touching = contacts.gap < _TOUCHING * jnp.vectorize(rod.outline)(contacts.X)
         pushes = contacts.force[..., None] * contacts.normal + contacts.friction
         pushes = jnp.where(touching[..., None], pushes, 0.0)
         wrenches = jnp.concatenate([jnp.zeros_like(pushes), pushes], axis=-1)
