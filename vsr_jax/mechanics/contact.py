@@ -26,7 +26,7 @@ $\lambda > s$ closes its gap at once, which throws the arm about.
 From the rest shape b begins as 0.1 of the arm and c as 0.02. The force is then given by the gap,
 $\lambda = \tfrac{k}{2 c} (\sqrt{g^2 + 4 c b^2} - g)$, so that the balance is the gradient of an
 energy, which shows whether a step is an advance; a creeping motion under all loads approaches it.
-After that both become smaller together. Friction (see `slip`) comes last.
+After that both become smaller together, and friction (see `slip`) grows.
 """
 
 from dataclasses import replace
@@ -44,7 +44,7 @@ from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import Grid, locate
 from ..numerics.se3 import base_pose, stacked_rotation
 from ..typing import DTypeLike
-from .coupling import HARDENED, SOFTENED, ArmProblem, ArmState, Coupling, PointForces
+from .coupling import SOFTENED, ArmProblem, ArmState, Coupling, PointForces
 from .held import of_forces
 from .pose_terms import finite
 from .reaction import Loading
@@ -62,6 +62,10 @@ the start."""
 _RIGID = 2 / 3
 """Power of the machine epsilon that is the least compliance of a contact in the approximate
 tangent, in units of 1 / k."""
+
+_SMOOTH = 0.2
+"""Hardness up to which contacts have no friction; then it grows: all of it at once throws the arm
+about."""
 
 _NO_FRICTION = 1e-9
 """Friction that counts as none, in units of k and the arm's length."""
@@ -116,6 +120,7 @@ class Contacts(Coupling):
 
     def softened(self, hardness: Array) -> "Contacts":
         of, length = self.scale.dtype, self.rod.length
+        roughness = jnp.clip((hardness - _SMOOTH) / (1 - _SMOOTH), 0.0, 1.0)
         blur, give = (
             first * (last / first) ** hardness
             for first, last in zip(self.first, _LAST, strict=True)
@@ -126,7 +131,7 @@ class Contacts(Coupling):
             blur=(blur * length).astype(of),
             give=give.astype(of),
             flatness=jnp.maximum(self.flatness, _FLATTER * blur * length).astype(of),
-            friction=None if self.friction is None else (hardness > HARDENED) * self.friction,
+            friction=None if self.friction is None else roughness * self.friction,
         )
 
     def start(self, xi: Vector, problem: ArmProblem) -> Vector:

@@ -37,9 +37,6 @@ from .touch import from_cells, received, to_cells
 SOFTENED = (SOFT_STAGES - 0.5) / HARDENING_STAGES
 """Hardness from which constraints have no energy."""
 
-HARDENED = 1 - 0.5 / HARDENING_STAGES
-"""Hardness from which constraints are exact, but for the rounding of the last stage."""
-
 _IDLE = 0.75
 """Power of the machine epsilon below which a row of the Schur complement is taken to be zero, as of
 a section held in a direction in which the arm cannot move."""

@@ -47,8 +47,9 @@ _FIRST_STAGES = 80
 """Bound on the evaluations of the first careful attempt where there are stages."""
 _SLOW_DAMPING, _HARDER = 100.0, 0.25
 """Damping with which the second one begins, and by how much of a stage its springs are harder."""
-_SLIDING = 20
-"""Bound on the evaluations of a first attempt where something slides with friction."""
+_SLIDING, _CLOSE = 20, 1e-3
+"""Bound on the evaluations of a first attempt where something slides with friction, and size of a
+step below which the attempt may take twice as many."""
 _SETTLED = 0.3
 """Size of an undamped step below which springs are replaced by the constraints that they stand
 for."""
@@ -157,7 +158,8 @@ def damped_newton(
       the last stage follows at once.
       A problem that ends without a stable root begins once more, slowly, with harder springs.
     - Friction. What `slides` has no energy: its steps are accepted where the residual becomes
-      smaller, else halved, some times. Its first attempt has at most `_SLIDING` evaluations.
+      smaller, else halved, some times. Its first attempt has at most `_SLIDING` evaluations, near
+      the solution twice as many.
     - Probing. Where the tangent is doubtful at the end, the arm is moved from the solution by the
       last step, made small, and creeps: $s_{n+1} = s_n + (H + \mu \Sigma)^{-1} r(x - s_n)$. The
       solution is unstable if the motion grows after some steps.
@@ -260,7 +262,8 @@ def damped_newton(
             return x, new_step, earlier, guard
         failed = jnp.where(go, ~(taken & new.definite), old.definite & ~guard.definite)
         if cut is not None:
-            failed = (failed & ~(go & cut)) | (go & (old.spent >= _SLIDING))
+            bound = jnp.where(guard.size < _CLOSE, 2 * _SLIDING, _SLIDING)
+            failed = (failed & ~(go & cut)) | (go & (old.spent >= bound))
         if not twice:
             sound = guard.definite & (guard.merit <= accepted)
             ended = ~(going(guard) | probing(guard))
