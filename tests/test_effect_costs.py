@@ -10,7 +10,7 @@ import pytest
 import vsr_jax as vsr
 from vsr_jax.cli import main as cli
 from vsr_jax.studies import effects
-from vsr_jax.studies.timing import Timed, take_turns
+from vsr_jax.studies.timing import Timed, primitives, take_turns
 
 
 def test_every_scene_adds_one_effect():
@@ -108,9 +108,27 @@ def test_all_scenes_are_measured():
     operations = [cost.operations for cost in costs]
     assert operations[2] > operations[1]
     assert operations[9] > operations[2]
-    named = {cost.name: cost.operations for cost in costs}
-    for cost in costs[13:]:  # those with an obstacle
-        assert cost.operations > named[cost.base]
+
+
+@pytest.mark.slow
+def test_obstacles_and_their_friction_add_to_the_program():
+    """Equations, since operations count a pass along the arm in a loop as one of its steps."""
+    model, named = vsr.StrainDependent(4), {one.name: one for one in effects.scenes()}
+
+    def size(name):
+        def tip(inputs):
+            if named[name].followed:
+                path = vsr.follow(named[name].scene, inputs[None], model=model)
+                return jax.vmap(lambda eq: eq.tip)(path)
+            return vsr.solve(named[name].scene, inputs, model=model).tip
+
+        program = jax.make_jaxpr(tip)(jnp.array(named[name].inputs))
+        return sum(primitives(program).values())
+
+    assert size("pillar, not touched") > 1.5 * size("+ gravity")
+    path = f"touched, path of {effects.SAMPLES}"
+    assert size(path) > size("pillar, touched")
+    assert size("+ friction of contact") > 1.05 * size(path)
 
 
 @pytest.mark.slow
