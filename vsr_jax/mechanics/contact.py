@@ -41,6 +41,7 @@ from ..arm.obstacles import Obstacle
 from ..arm.rod import Rod
 from ..arm.scene import CrossSections, Scene
 from ..numerics.component import Forces, Vector
+from ..numerics.damped_newton import HARDENING_STAGES, SOFT_STAGES
 from ..numerics.quadrature import Grid, locate
 from ..numerics.se3 import base_pose, stacked_rotation
 from ..typing import DTypeLike
@@ -63,7 +64,7 @@ _RIGID = 2 / 3
 """Power of the machine epsilon that is the least compliance of a contact in the approximate
 tangent, in units of 1 / k."""
 
-_SMOOTH = 0.2
+_SMOOTH = SOFT_STAGES / HARDENING_STAGES
 """Hardness up to which contacts have no friction; then it grows: all of it at once throws the arm
 about."""
 

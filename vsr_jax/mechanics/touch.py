@@ -296,7 +296,7 @@ def _nearest(
     obstacle: Obstacle, rod: Rod, flatness: Array, start: Array, axis: Array, X: Array, h: Array
 ) -> _Nearest:
     """The nearest point of one step of one arm."""
-    step = _Step(obstacle, rod, flatness, start, axis, X, h)
+    step = _Step(obstacle, rod, flatness, start, axis, X, h).faded()
     fixed = lax.stop_gradient(step)
     s = _search(fixed)
     rate, curvature = fixed.slope(s), fixed.curvature(s)
@@ -321,7 +321,7 @@ class _Step(NamedTuple):
 
     obstacle: Obstacle
     rod: Rod
-    flatness: Array
+    epsilon: Array
     start: Array
     axis: Array
     X: Array
@@ -335,12 +335,15 @@ class _Step(NamedTuple):
         """Gap there."""
         return self.obstacle.distance(self.place(s)) - self.rod.outline(self.X + s * self.h)
 
+    def faded(self) -> "_Step":
+        """The step with less epsilon the more the gap bulges."""
+        first, middle, last = jax.vmap(self.gap)(jnp.array([0.0, 0.5, 1.0], self.h.dtype))
+        bulge = jnp.maximum(0.5 * (first + last) - middle, 0.0) / self.epsilon
+        return self._replace(epsilon=self.epsilon * jnp.exp(-(bulge**2)))
+
     def lifted(self, s: Array) -> Array:
         """Gap with the term in epsilon."""
-        first, middle, last = jax.vmap(self.gap)(jnp.array([0.0, 0.5, 1.0], self.h.dtype))
-        bulge = jnp.maximum(0.5 * (first + last) - middle, 0.0) / self.flatness
-        fading = self.flatness * jnp.exp(-(bulge**2))
-        return self.gap(s) + fading * (2 * s - 1) ** 2
+        return self.gap(s) + self.epsilon * (2 * s - 1) ** 2
 
     def slope(self, s: Array) -> Array:
         """Its derivative."""

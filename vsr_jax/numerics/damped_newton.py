@@ -283,11 +283,10 @@ def damped_newton(
         second = second._replace(applied=second.applied + _HARDER, damping=slow)
 
     def begin(like: tuple | None) -> tuple:
-        step = (
-            jax.eval_shape(evaluate, start, floor, floor, first.fresh).step
-            if like is None
-            else like[1]
-        )
+        if like is None:
+            step = jax.eval_shape(evaluate, start, floor, floor, once_more(first)).step
+        else:
+            step = like[1]
         step = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), step)
         return start, step, None if measures.dot is None else Earlier(step, step, step), first
 
