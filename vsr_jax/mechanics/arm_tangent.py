@@ -76,12 +76,13 @@ def approximate_solve(
     if symmetric:
         points = {place: one._replace(wrench=one.direction) for place, one in points.items()}
     pushes = [one.pushes(right.coupled[place]) for place, one in points.items()]
-    if slopes is not None and slopes.cells is not None:
-        slopes = slopes._replace(cells=slopes.cells + sum(one.slopes() for one in points.values()))
+    if slopes is not None and slopes.contacts is not None:
+        (springs,) = points.values()
+        slopes = slopes._replace(cells=springs.slopes(slopes.contacts))
 
     def solve(b: Vector, *push: Array) -> tuple[Vector, Definiteness]:
         if along is not None and slopes is not None and slopes.motion == 6:
-            return eliminate_poses(lower, b, unknown.xi, along, slopes, grid, free, flexible, *push)
+            return eliminate_poses(lower, b, along, slopes, grid, free, flexible, *push)
         return eliminate(lower, b, along, slopes, grid, free, flexible)
 
     if along is not None and loads is not None and pull is not None:
@@ -98,7 +99,7 @@ def approximate_solve(
             coupled[place], first = x[first : first + len(part)], first + len(part)
     for place, one in points.items():
         assert along is not None
-        coupled[place] = one.change(coupled[place], motions(strain, unknown.xi, along, grid))
+        coupled[place] = one.change(coupled[place], motions(strain, along, grid))
     return ArmUnknown(strain, tuple(coupled)), negative == 0, doubtful
 
 

@@ -22,6 +22,7 @@ from typing import Any, ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, PyTree
 
 from ..arm.scene import CrossSections, Scene
@@ -29,10 +30,11 @@ from ..numerics import component as c, lu
 from ..numerics.component import Forces, Vector
 from ..numerics.damped_newton import HARDENING_STAGES, SOFT_STAGES
 from ..numerics.quadrature import Grid
+from ..numerics.stacked import once, total
 from .balance import without_force
 from .reaction import Loading, Reaction
 from .slip import Slip
-from .touch import from_cells, received, to_cells
+from .touch import at_cells, from_cells, received, to_cells
 
 SOFTENED = (SOFT_STAGES - 0.5) / HARDENING_STAGES
 """Hardness from which constraints have no energy."""
@@ -184,11 +186,15 @@ class PointForces(NamedTuple):
     handed: Array
     slip: Slip | None = None
 
-    def slopes(self) -> Array:
-        """Derivatives (6, 6, stages, steps, ...) of the wrenches by the motions."""
-        stiffness = -self.cell * self.factors / self.corner
-        square = self.wrench[:, None] * self.direction
-        return to_cells(jnp.sum(stiffness * square[:, :, None], axis=3), 2)
+    def slopes(self, contacts: Array) -> Array:
+        """Derivatives (6, 6, stages, steps, ...) of the wrenches by the motions of the ends of the
+        cells, with those of given `contacts` (6, 6, obstacles, steps, ...)."""
+        stiffness = once(self.factors) / self.corner
+        square = (stiffness * self.wrench)[:, None] * self.direction
+        for place in range(0, square.shape[2], contacts.shape[2]):
+            here = lax.slice_in_dim(square, place, place + contacts.shape[2], axis=2)
+            contacts = contacts - here
+        return at_cells(self.cell[:, : contacts.shape[2]], once(contacts))
 
     def pushes(self, rows: PyTree) -> Array:
         """Changes (6, stages, steps, ...) of the wrenches by given rows (n * steps, ...) alone."""
@@ -196,12 +202,12 @@ class PointForces(NamedTuple):
         if self.slip is not None:  # friction on the arm is what its unknown is without the row
             first, *tangents = jnp.split(self._listed(rows), 3)
             force = force - jnp.concatenate([jnp.zeros_like(first), *tangents])
-        return to_cells(jnp.sum(self.cell * (force * self.wrench)[:, None], axis=2), 1)
+        return to_cells(total(self.cell * once(force * self.wrench)[:, None], 2), 1)
 
     def change(self, rows: PyTree, motions: Array) -> PyTree:
         """Changes of the unknowns for given rows and motions (6, stages, steps, ...)."""
-        there = jnp.sum(self.cell * from_cells(motions, 1)[:, :, None], axis=1)
-        moved = self.factors * jnp.sum(self.direction * there, axis=0)
+        there = total(self.cell * from_cells(motions, 1)[:, :, None], 1)
+        moved = self.factors * total(self.direction * there, 0)
         change = (self._listed(rows) - moved) / self.corner
         change = change - received(self.handed, change)
         if self.slip is None:

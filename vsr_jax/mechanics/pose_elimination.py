@@ -1,16 +1,28 @@
 r"""The tangent of the balance under loads that depend on positions, solved by block elimination.
 
-As in `elimination`, each node represents a cell of its weight w, integrated by the midpoint rule.
-In the frame of its section the motion of a section is $z = (\theta, \rho)$, rotation and
-displacement, and the change of the wrench at its end an affine function of it, $P z + p$: the
-stiffness of the arm beyond, springs included, so that a stiff spring is eliminated exactly. With
-$K = (C; F)$ the derivative of the load density (c, f) by the motion,
+As in `elimination`, each node represents a cell of its weight w, integrated by the midpoint rule:
+the arm is a chain of hinges at the nodes, which turn by $w\kappa$ and slide by $w\upsilon$, with
+stiff links between them. All is in the world's axes and, at each hinge, about its point. The motion
+of the arm beyond a hinge is $z = (\theta, \rho)$, rotation and displacement; the change of the
+wrench there, as seen by the moving section, is $Q z + q$. With the wrench $W = (m, n)$ and
 
-$$\theta' = \kappa, \quad \rho' = \theta \times u + \upsilon, \quad
--\delta m' = \rho' \times n + u \times \delta n + C z, \quad -\delta n' = F z,$$
+$$A = \begin{pmatrix} -\tilde m & -\tilde n \\ -\tilde n & 0 \end{pmatrix}, \quad
+\hat Q = Q + \tfrac12 A,$$
 
-and $H \, \delta\xi = (\delta m - \theta \times m, \delta n - \theta \times n) + b$ in the middle of
-the cell is a 6 x 6 system for the strain $\delta\xi = (\kappa, \upsilon)$, solved by blocks.
+$\hat Q$ is symmetric where the loads have a potential. It is the stiffness of the arm beyond,
+springs included, so that a stiff spring is eliminated exactly. A hinge with the strain $\delta\xi =
+(\kappa, \upsilon)$ and the motion z before it has
+
+$$(H + H_w - w \hat Q) \, \delta\xi = (\hat Q - \tfrac12 A) z + q + b$$
+
+and before it is $\hat Q z + q + w (\hat Q + \tfrac12 A) \, \delta\xi$. A cell bends evenly, and
+not at a hinge: by the midpoint rule this adds $H_w = \tfrac{w^2}8 (\tilde u \tilde n + \tilde n
+\tilde u)$ to the bending stiffness, with the axis u; without it an arm that buckles seems too soft.
+A link of the vector d moves what is beyond it by $\rho + \theta \times d$. Loads between two nodes
+act at the end of the first cell: one with the wrench (c, f) and the derivative K by the motion
+there adds
+
+$$K + \tfrac12 \begin{pmatrix} \tilde c & -\tilde f \\ \tilde f & 0 \end{pmatrix}.$$
 """
 
 from functools import partial
@@ -39,41 +51,33 @@ from ..numerics.stacked import (
 )
 from .elimination_nodes import (
     Definiteness,
-    Node,
     asymmetry_of,
+    at_last_nodes,
     definiteness,
     inverse_block,
-    node_components,
-    nodes_of,
-    seen_from,
-    turns,
+    jumps,
 )
 from .reaction import Reaction, Slopes
 
 
-class PoseCell(NamedTuple):
-    r"""Coefficients of one cell that do not depend on P.
+class Hinge(NamedTuple):
+    r"""The hinge at a node, of size 3 if only bending and twist are free, else 6, and the loads at
+    the end of its cell.
 
-    - `width` w; `turn`: rotation of the next node's section in this frame; `reaction`: the moment.
-    - `lever` $-\frac w2 \tilde u$: the motion in the middle of the cell is $Z (z + \frac w2
-      \delta\xi)$ with $Z = (1, 0; \text{lever}, 1)$.
-    - `stiff`: the 6 x 6 system without P; `drive`, `right`: its right side per motion, and b.
-    - Over the cell the wrench changes by `by_motion` z + `by_strain` $\delta\xi$, without the part
-      through P.
-    - `jump`: derivative of the load at the end of the cell by its motion, None without such loads;
-      `push`: right side of the wrenches there, None without one.
+    - `width` w; `link`: vector to the end of the cell; `rotation` of the section.
+    - `stiff`: H; `wrench` W; `right`: b.
+    - `load` (6): wrench of the loads at the end; `jump`: derivative by the motion there, None
+      without such loads; `push`: right side of the wrench there, None without one.
     - `flexible`: 1, or 0 where the section is rigid; None without rigid pieces.
     """
 
     width: Array
-    turn: Array
-    reaction: Array
-    lever: Array
+    link: Array
+    rotation: Array
     stiff: Array
-    drive: Array
+    wrench: Array
     right: Array
-    by_motion: Array
-    by_strain: Array
+    load: Array
     jump: Array | None
     push: Array | None
     flexible: Array | None
@@ -82,7 +86,6 @@ class PoseCell(NamedTuple):
 def eliminate_poses(
     lower: Matrix,
     right: Vector,
-    xi: Vector,
     along: Reaction,
     slopes: Slopes,
     grid: Grid,
@@ -95,31 +98,39 @@ def eliminate_poses(
     **Arguments:** `push`: changes (6, stages, steps, *arms) of the wrenches at the ends of the
     cells in the world frame that do not depend on the motions, a right side too.
     """
-    nodes = nodes_of(c.symmetric(lower), right, xi, along, slopes, grid, flexible, push)
-    cells = jax.vmap(_cell_of)(nodes, turns(nodes.rotation))
-    arms = nodes.weight.shape[1:]
-    nothing = jnp.zeros((6, 7, *arms), cells.width.dtype)
-    _, (X, negative, asymmetry) = lax.scan(partial(_cell, free), nothing, cells, reverse=True)
+    H = c.symmetric(lower)
+    arms = jnp.broadcast_shapes(*(x.shape[2:] for x in (*H[0], *right, grid.weight, along.axis[0])))
+    hinges = _hinges(H, right, along, slopes, grid, free, flexible, push, arms)
+    hinges = jax.tree.map(lambda x: jnp.moveaxis(x, -1 - len(arms), 0), hinges)
+    nothing = jnp.zeros((6, 7, *arms), hinges.width.dtype)
+    _, (X, negative, asymmetry) = lax.scan(partial(_before, free), nothing, hinges, reverse=True)
 
-    def forward(z: Array, cell: tuple) -> tuple[Array, Array]:
-        X, turn, lever, width = jax.tree.map(once, cell)
-        strain = affine(X, z)
-        middle = z + 0.5 * width * strain
-        sheared = rows(middle, 3, 6) + matvec(lever, rows(middle, 0, 3))
-        end = 2.0 * jnp.concatenate([rows(middle, 0, 3), sheared]) - z
-        return turned(transpose(turn), end), strain
+    def forward(z: Array, hinge: tuple) -> tuple[Array, Array]:
+        X, link, width = jax.tree.map(once, hinge)
+        turn, shift = rows(z, 0, 3), rows(z, 3, 6)
+        strain = once(affine(X, jnp.concatenate([turn, shift + cross(turn, link)])))
+        bent = width * rows(strain, 0, 3)
+        shift = shift + cross(2.0 * turn + bent, link)
+        if len(strain) == 6:
+            shift = shift + width * rows(strain, 3, 6)
+        return once(jnp.concatenate([turn + bent, shift])), strain
 
     start = jnp.zeros((6, *arms), X.dtype)
-    _, strain = lax.scan(forward, start, (X, cells.turn, cells.lever, cells.width))
+    _, strain = lax.scan(forward, start, (X, hinges.link, hinges.width))
+    strain = jnp.moveaxis(strain, 0, 1)
+    strain = strain.reshape(-1, *grid.X.shape[1::-1], *arms).swapaxes(1, 2)
+    back = transpose(along.rotation)
+    strain = jnp.concatenate([matvec(back, part) for part in jnp.split(strain, len(strain) // 3)])
     local = jnp.ones(negative.shape, bool)
-    return node_components(strain, grid), definiteness(negative, local, asymmetry, grid)
+    # turning a strain into the world frame and back leaves rounding in those that are locked
+    found = tuple(strain[i] if i in free else jnp.zeros_like(strain[0]) for i in range(6))
+    return found, definiteness(negative, local, asymmetry, grid)
 
 
-def motions(strain: Vector, xi: Vector, along: Reaction, grid: Grid) -> Array:
+def motions(strain: Vector, along: Reaction, grid: Grid) -> Array:
     """Rotations and displacements (6, stages, steps, *arms) in the world frame of the ends of the
     cells by a change of strain, as the elimination has them."""
     change = grid.weight * turned(along.rotation, stack(strain))
-    axis = grid.weight * matvec(along.rotation, stack(xi[3:]))
 
     def summed(x: Array) -> Array:
         """Sums over the cells from the base."""
@@ -130,97 +141,142 @@ def motions(strain: Vector, xi: Vector, along: Reaction, grid: Grid) -> Array:
     bent = rows(change, 0, 3)
     ends = summed(bent)
     middle = ends - 0.5 * bent
-    return jnp.concatenate([ends, summed(cross(middle, axis) + rows(change, 3, 6))])
+    moved = cross(middle, grid.weight * along.axis) + rows(change, 3, 6)
+    return jnp.concatenate([ends, summed(moved)])
 
 
-def _cell_of(node: Node, turn: Array) -> PoseCell:
-    """All that does not depend on P, for one node."""
-    w = node.weight
-    u, m, n = skew(node.axis), skew(rows(node.wrench, 0, 3)), skew(rows(node.wrench, 3, 6))
-    none, lever = jnp.zeros_like(n), -0.5 * w * u
-    H = _blocks(node.bending, node.mixed, transpose(node.mixed), node.linear)
-    by_middle = _blocks(matmul(n, u), none, none, none)
-    if node.density is not None:
-        by_middle = by_middle + _from_left(lever, seen_from(node.rotation, node.density))
-    by_motion = _from_right(w * by_middle, lever)
-    by_strain = w * _blocks(none, -n, none, none)
-    drive = 0.5 * by_motion + _blocks(m, none, n, none)
-    return PoseCell(
-        w,
-        turn,
-        rows(node.wrench, 0, 3),
-        lever,
-        H - 0.5 * (w * drive + by_strain),
-        drive,
-        node.right,
-        by_motion,
-        0.5 * w * by_motion + by_strain,
-        None if node.jump is None else seen_from(node.rotation, node.jump),
-        None if node.push is None else turned(transpose(node.rotation), node.push),
-        node.flexible,
+def _hinges(
+    H: Matrix,
+    right: Vector,
+    along: Reaction,
+    slopes: Slopes,
+    grid: Grid,
+    free: tuple[int, ...],
+    flexible: Array | None,
+    push: Array | None,
+    arms: tuple[int, ...],
+) -> Hinge:
+    """All hinges, in the axis in front of that of the arms."""
+
+    def listed(x: Array) -> Array:
+        """Nodes one after another of an array (..., stages, steps, *arms)."""
+        first = x.ndim - len(arms) - 2
+        x = jnp.broadcast_to(x, (*x.shape[: first + 2], *arms)).swapaxes(first, first + 1)
+        return once(x.reshape(*x.shape[:first], -1, *arms))
+
+    def block(first: int, second: int) -> Array:
+        entries = [listed(H[first + i][second + j]) for i in range(3) for j in range(3)]
+        return jnp.stack(jnp.broadcast_arrays(*entries)).reshape(3, 3, -1, *arms)
+
+    def after(x: Array) -> Array:
+        """Values at the next nodes, zero beyond the tip."""
+        place = x.ndim - len(arms) - 1
+        room = [(0, 0)] * x.ndim
+        room[place] = (0, 1)
+        return jnp.pad(lax.slice_in_dim(x, 1, None, axis=place), room)
+
+    R, w, wrench = listed(along.rotation), listed(grid.weight), listed(along.world)
+    m, n = rows(wrench, 0, 3), rows(wrench, 3, 6)
+    reach = 0.5 * w * listed(along.axis)  # from the node to the end of its cell
+    couple = m - cross(reach, n) - after(m + cross(reach, n))
+    load = jnp.concatenate([couple, n - after(n)])
+    jump = jumps(slopes, grid)
+    if jump is not None:
+        jump = listed(at_last_nodes(jump, grid.X.shape[0]))
+    if slopes.cells is not None:
+        cells = listed(slopes.cells)
+        jump = cells if jump is None else jump + cells
+    if slopes.density is not None:
+        density = 0.5 * w * listed(slopes.density)
+        density = _before_link(density, -reach) + _before_link(after(density), after(reach))
+        jump = density if jump is None else jump + density
+    b, stiff = turned(R, stack(tuple(listed(x) for x in right))), _seen_from(R, block(0, 0))
+    even = matmul(skew(reach), skew(n))
+    stiff = stiff + 0.25 * w * (even + transpose(even))
+    if max(free) > 2:
+        mixed, linear = (_seen_from(R, block(i, 3)) for i in (0, 3))
+        stiff = _blocks(stiff, mixed, transpose(mixed), linear)
+    push, flexible = (None if x is None else listed(x) for x in (push, flexible))
+    return Hinge(w, reach, R, stiff, wrench, b[: len(stiff)], load, jump, push, flexible)
+
+
+def _before(free: tuple[int, ...], end: Array, hinge: Hinge) -> tuple[Array, tuple]:
+    r"""One cell: from $\hat Q$ and q (6, 7) beyond its end to those at its start; the affine strain
+    by the motion of the section of the hinge before it (size, 7), the number of negative pivots and
+    the asymmetry."""
+    hinge = jax.tree.map(once, hinge)
+    size, w = len(hinge.stiff), hinge.width
+    half = _half(hinge.wrench)
+    load = -_half(hinge.load)
+    load = jnp.concatenate([columns(load, 0, 3), -columns(load, 3, 6)], axis=1)
+    if hinge.jump is not None:
+        load = load + hinge.jump
+    constant = end[:, 6]
+    if hinge.push is not None:
+        constant = constant + hinge.push
+    end = jnp.concatenate([columns(end, 0, 6) + load, constant[:, None]], axis=1)
+    beyond = _before_link(end, hinge.link)
+    Q = columns(beyond, 0, 6)
+    given = columns(beyond, 0, 7)[:size] + jnp.concatenate(
+        [transpose(half[:, :size]), hinge.right[:, None]], axis=1
     )
-
-
-def _cell(free: tuple[int, ...], end: Array, cell: PoseCell) -> tuple[Array, tuple]:
-    """One cell, from its end to its start: the affine change of the wrench at the start (6, 7), the
-    affine strain by the motion at the start (6, 7), the number of negative pivots and the asymmetry
-    of the cell."""
-    cell = jax.tree.map(once, cell)
-    w, lever = cell.width, cell.lever
-    by_motion = seen_from(transpose(cell.turn), columns(end, 0, 6))
-    if cell.jump is not None:
-        by_motion = by_motion + cell.jump
-    constant = turned(cell.turn, end[:, 6])
-    if cell.push is not None:
-        constant = constant + cell.push
-    P = jnp.concatenate([by_motion, constant[:, None]], axis=1)
-    middle = _from_left(lever, P)  # of the wrench in the middle of the cell
-    square = once(_from_right(columns(middle, 0, 6), lever))
-    by_start = 2.0 * square - columns(middle, 0, 6) + cell.drive
-    constant = columns(middle, 6, 7) + cell.right[:, None]
     X, negative, compliance = _solved(
-        cell.stiff - w * square, jnp.concatenate([by_start, constant], axis=1), free
+        hinge.stiff - w * Q[:size, :size], given, hinge.rotation, free
     )
-    if cell.flexible is not None:
-        bends = cell.flexible > 0
+    if hinge.flexible is not None:
+        bends = hinge.flexible > 0
         X, compliance = (jnp.where(bends, x, 0.0) for x in (X, compliance))
         negative = jnp.where(bends, negative, 0)
-    start = 2.0 * middle - P  # of the wrench at the start of the cell, without its own loads
-    square = once(_from_right(columns(start, 0, 6), lever))
-    by_start = 2.0 * square - columns(start, 0, 6) + cell.by_motion
-    start = jnp.concatenate([by_start, columns(start, 6, 7)], axis=1)
-    start = start + matmul(w * square + cell.by_strain, X)
-    by_rotation = 0.5 * (P[:3, :3] + start[:3, :3])
-    return start, (X, negative, asymmetry_of(by_rotation, cell.reaction, compliance))
+    start = beyond + matmul(w * (Q[:, :size] + half[:, :size]), X)
+    start = _before_link(start, hinge.link)
+    return start, (X, negative, asymmetry_of(Q[:3, :3], None, compliance))
 
 
-def _solved(D: Array, right: Array, free: tuple[int, ...]) -> tuple[Array, Array, Array]:
-    """Solution of a 6 x 6 system for the free strains, zero for the others, the number of negative
+def _half(wrench: Array) -> Array:
+    r"""$\tfrac12 A$ of a wrench (6)."""
+    m, n = (-0.5 * skew(rows(wrench, i, i + 3)) for i in (0, 3))
+    return _blocks(m, n, n, jnp.zeros_like(m))
+
+
+def _solved(D: Array, right: Array, R: Array, free: tuple[int, ...]) -> tuple[Array, Array, Array]:
+    """Solution of a system for the free strains, zero for the others, the number of negative
     eigenvalues of the matrix, and the inverse of its bending block."""
+    bent, stretched = tuple(i for i in free if i < 3), tuple(i - 3 for i in free if i > 2)
+    if not stretched:
+        compliance, negative = _inverse(D, R, bent)
+        return matmul(compliance, right), negative, compliance
     b, below, d = D[:3, 3:], D[3:, :3], D[3:, 3:]
-    flexibility, first = inverse_block(d, tuple(i - 3 for i in free if i > 2))
+    flexibility, first = _inverse(d, R, stretched)
     across = matmul(b, flexibility)
-    compliance, second = inverse_block(
-        D[:3, :3] - matmul(across, below), tuple(i for i in free if i < 3)
-    )
-    bent = matmul(compliance, right[:3] - matmul(across, right[3:]))
-    stretched = matmul(flexibility, right[3:] - matmul(below, bent))
-    return jnp.concatenate([bent, stretched]), first + second, compliance
+    compliance, second = _inverse(D[:3, :3] - matmul(across, below), R, bent)
+    bending = matmul(compliance, right[:3] - matmul(across, right[3:]))
+    stretch = matmul(flexibility, right[3:] - matmul(below, bending))
+    return jnp.concatenate([bending, stretch]), first + second, compliance
+
+
+def _inverse(matrix: Array, R: Array, places: tuple[int, ...]) -> tuple[Array, Array]:
+    """Inverse for the free strains among three of the section, and its negative eigenvalues."""
+    if len(places) == 3:
+        return inverse_block(matrix, places)
+    inverse, negative = inverse_block(_seen_from(transpose(R), matrix), places)
+    return _seen_from(R, inverse), negative
+
+
+def _seen_from(R: Array, matrix: Array) -> Array:
+    r"""$R M R^T$."""
+    return matmul(matmul(R, matrix), transpose(R))
+
+
+def _before_link(beyond: Array, link: Array) -> Array:
+    """What acts at the end of a link by the motion there (6, 6 or 7, ...), at its start."""
+    d = link[:, None]
+    above, below = rows(beyond, 0, 3), rows(beyond, 3, 6)
+    beyond = once(jnp.concatenate([above + cross(d, below), below]))
+    turning = transpose(columns(beyond, 0, 3)) + cross(d, transpose(columns(beyond, 3, 6)))
+    return once(jnp.concatenate([transpose(turning), columns(beyond, 3, beyond.shape[1])], axis=1))
 
 
 def _blocks(a: Array, b: Array, below: Array, d: Array) -> Array:
     """Matrix (6, 6, ...) of four blocks."""
     top, bottom = jnp.concatenate([a, b], axis=1), jnp.concatenate([below, d], axis=1)
     return jnp.concatenate([top, bottom])
-
-
-def _from_left(lever: Array, a: Array) -> Array:
-    r"""$Z^T A$ of a matrix with six rows."""
-    upper = rows(a, 0, 3) + matmul(transpose(lever), rows(a, 3, 6))
-    return jnp.concatenate([upper, rows(a, 3, 6)])
-
-
-def _from_right(a: Array, lever: Array) -> Array:
-    r"""$A Z$ of a matrix with six columns."""
-    left = columns(a, 0, 3) + matmul(columns(a, 3, 6), lever)
-    return jnp.concatenate([left, columns(a, 3, 6)], axis=1)

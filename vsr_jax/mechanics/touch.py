@@ -36,7 +36,7 @@ from ..arm.obstacles import Obstacle
 from ..arm.rod import Rod
 from ..numerics.batching import arms_in
 from ..numerics.quadrature import Grid, gauss_legendre, interpolation
-from ..numerics.stacked import columns, cross, matmul, rows, skew
+from ..numerics.stacked import columns, cross, matmul, once, rows, skew, total
 from .pose_terms import starts_of
 from .slip import Rough, Slip, slip_of
 
@@ -175,8 +175,8 @@ def touch_of(axis: Array, rotation: Array, grid: Grid, around: Surroundings) -> 
     cell = _cell_of(near.sigma, grid.X.shape[0])
     along = jnp.pad(grid.weight * axis, [(0, 0), (1, 0), *[(0, 0)] * (axis.ndim - 2)])
     ends = starts[:, None] + jnp.cumsum(along, axis=1)
-    lever = near.place - jnp.sum(cell * ends[:, :, None], axis=1)
-    return Touch(
+    lever = near.place - total(cell * ends[:, :, None], 1)
+    found = Touch(
         gap,
         raised,
         near.normal,
@@ -190,6 +190,7 @@ def touch_of(axis: Array, rotation: Array, grid: Grid, around: Surroundings) -> 
         lever,
         handed,
     )
+    return jax.tree.map(once, found)
 
 
 def contact_wrenches(touch: Touch) -> Array:
@@ -197,24 +198,29 @@ def contact_wrenches(touch: Touch) -> Array:
     moments of their forces about the node."""
 
     def beyond(x: Array) -> Array:
-        of_step = jnp.sum(x, axis=1)
+        of_step = total(x, 1)
         later = lax.cumsum(of_step, axis=1, reverse=True) - of_step
-        return later[:, None] + jnp.sum(touch.shares[None] * x[:, None], axis=2)
+        return later[:, None] + total(touch.shares[None] * x[:, None], 2)
 
     push, moment = beyond(touch.push), touch.moment
     return jnp.concatenate([jnp.zeros_like(push) if moment is None else beyond(moment), push])
 
 
-def at_cells(touch: Touch) -> Array:
-    """Derivatives (6, 6, stages, steps, *arms) of all contact wrenches by the motions of the ends
-    of the cells of the nodes."""
+def touch_slopes(touch: Touch) -> Array:
+    """Derivatives (6, 6, obstacles, steps, *arms) of the contact wrenches by the motions of the
+    ends of their cells."""
     d, f = skew(touch.lever), skew(touch.push)
     turned, moved = columns(touch.slope, 0, 3), columns(touch.slope, 3, 6)
     slope = jnp.concatenate([turned - matmul(moved, d), moved], axis=1)
     moment = rows(slope, 0, 3) + matmul(d, rows(slope, 3, 6))
     turning = jnp.concatenate([matmul(f, d), jnp.zeros_like(d)], axis=1)
-    slope = jnp.concatenate([moment + turning, rows(slope, 3, 6)])
-    return to_cells(jnp.sum(touch.cell * slope[:, :, None], axis=3), 2)
+    return once(jnp.concatenate([moment + turning, rows(slope, 3, 6)]))
+
+
+def at_cells(cell: Array, slopes: Array) -> Array:
+    """Derivatives (6, 6, stages, steps, *arms) of wrenches by the motions of the ends of the cells,
+    from those of each contact (6, 6, obstacles, steps, *arms) and its `Touch.cell`."""
+    return to_cells(total(cell * slopes[:, :, None], 3), 2)
 
 
 def to_cells(x: Array, axis: int) -> Array:
@@ -306,9 +312,10 @@ def _nearest(
     s = jnp.clip(s - jnp.where(inside, step.slope(s) / curvature, 0.0), 0.0, 1.0)
     r, along = jax.jvp(step.place, (s,), (jnp.ones_like(s),))
     normal, turn = jax.jvp(jax.grad(obstacle.distance), (r,), (along,))
-    bend = jax.jacfwd(jax.grad(obstacle.distance))(r)
-    moved = jnp.concatenate([jnp.cross(along, normal), turn])
-    slope = -jnp.where(inside, 1 / curvature, 0.0) * moved[:, None] * moved[None]
+    bend = once(jax.jacfwd(jax.grad(obstacle.distance))(r))
+    moved = once(jnp.concatenate([jnp.cross(along, normal), turn]))
+    slide = once(jnp.where(inside, -1 / curvature, 0.0) * moved)
+    slope = slide[:, None] * moved[None]
     at_end, at_start = (s >= 1) & (rate < 0), (s <= 0) & (rate > 0)
     nearer = at_end.astype(h.dtype) - at_start.astype(h.dtype)
     slope = slope.at[3:, 3:].add(bend)

@@ -11,6 +11,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+_FEW = 16
+"""Number of terms up to which `total` adds them one by one."""
+
 
 def stack(components: tuple[Array, ...], axis: int = 0) -> Array:
     """Array of components that broadcast to one shape."""
@@ -40,18 +43,20 @@ def components(x: Array) -> tuple[Array, ...]:
 
 def matmul(a: Array, b: Array) -> Array:
     """Product of the matrices (n, k, ...) and (k, m, ...)."""
-    return once(_sum(a[:, :, None] * b[None]))
+    return once(total(a[:, :, None] * b[None], 1))
 
 
 def matvec(a: Array, v: Array) -> Array:
     """Product of a matrix (n, k, ...) and a vector (k, ...)."""
-    return _sum(a * v[None])
+    return total(a * v[None], 1)
 
 
-def _sum(products: Array) -> Array:
-    """Sum over the second axis; a reduction of so few terms is slow in a batch."""
-    parts = [columns(products, i, i + 1) for i in range(products.shape[1])]
-    return lax.squeeze(sum(parts[1:], parts[0]), (1,))
+def total(x: Array, axis: int) -> Array:
+    """Sum over an axis; where it is short term by term, since a reduction is slow in a batch."""
+    if x.shape[axis] > _FEW:
+        return jnp.sum(x, axis)
+    parts = [lax.slice_in_dim(x, i, i + 1, axis=axis) for i in range(x.shape[axis])]
+    return lax.squeeze(sum(parts[1:], parts[0]), (axis,))
 
 
 def turned(R: Array, wrench: Array) -> Array:
