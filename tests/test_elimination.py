@@ -27,10 +27,16 @@ LOADS = {
 }
 
 
-def error(loads, order):
+BY_POSITION = {
+    "spring": [vsr.Gravity(), vsr.Spring((0.2, 0.1, 0.3), 0.5, 0.3)],
+    "spinning": [vsr.Spinning((0.0, 0.0, 8.0)), vsr.TipWrench((0.02, 0.01, 0.03), frame="body")],
+}
+
+
+def error(loads, order, steps=16):
     """Relative error of a smooth change of strain that is found again from the exact change of the
     residual along it."""
-    scene, model = vsr.Scene(ROD, [TENDON], loads), vsr.StrainDependent(16, order)
+    scene, model = vsr.Scene(ROD, [TENDON], loads), vsr.StrainDependent(steps, order)
     free, problem = scene.free, problem_of(scene, jnp.array([5.0]), model.grid(scene))
     x, rng = problem.grid.X / LENGTH, np.random.default_rng(0)
     sizes = np.array([2.0, 4.0, 4.0, 0.01, 0.01, 0.01])
@@ -70,6 +76,15 @@ def error(loads, order):
 def test_it_is_that_of_the_collocation(name, order, bound):
     """Cells by the midpoint rule, one per node, were off by a few percent at orders 4 and 6."""
     assert error(LOADS[name], order) < bound
+
+
+@pytest.mark.parametrize("name", BY_POSITION)
+@pytest.mark.parametrize(("order", "ratio"), [(2, 0.27), (4, 0.52)])
+def test_by_positions_it_converges_with_the_cells(name, order, ratio):
+    """Each node is a cell of its own then, which only at order 2 has the node in its middle."""
+    coarse, fine = (error(BY_POSITION[name], order, steps) for steps in (16, 32))
+    assert coarse < 1.5e-2
+    assert fine < ratio * coarse
 
 
 def test_a_small_change_of_a_heavy_arm_takes_few_steps():

@@ -65,7 +65,7 @@ class Hinge(NamedTuple):
     the end of its cell.
 
     - `width` w; `link`: vector to the end of the cell; `rotation` of the section.
-    - `stiff`: H; `wrench` W; `right`: b.
+    - `stiff`: $H + H_w$; `wrench` W; `right`: b.
     - `load` (6): wrench of the loads at the end; `jump`: derivative by the motion there, None
       without such loads; `push`: right side of the wrench there, None without one.
     - `flexible`: 1, or 0 where the section is rigid; None without rigid pieces.
@@ -239,8 +239,9 @@ def _half(wrench: Array) -> Array:
 
 
 def _solved(D: Array, right: Array, R: Array, free: tuple[int, ...]) -> tuple[Array, Array, Array]:
-    """Solution of a system for the free strains, zero for the others, the number of negative
-    eigenvalues of the matrix, and the inverse of its bending block."""
+    """Solution of the system D of a hinge for the free strains of a section with the rotation R,
+    zero for the others, the number of negative eigenvalues of D, and the inverse of its bending
+    block."""
     bent, stretched = tuple(i for i in free if i < 3), tuple(i - 3 for i in free if i > 2)
     if not stretched:
         compliance, negative = _inverse(D, R, bent)
