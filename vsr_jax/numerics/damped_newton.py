@@ -232,7 +232,7 @@ def damped_newton(
             old, new, left, taken, plain | hard, damping, applied, floor, accepted, small
         )
         if cut is not None:
-            shorter = old._replace(spent=guard.spent, cuts=old.cuts + 1)
+            shorter = _shorter(old)
             guard = select(cut, shorter, guard._replace(cuts=jnp.zeros_like(old.cuts)))
         guard = guard._replace(plain=old.plain + plain.astype(jnp.int32))
         more = jnp.where(probe, 1.0, jnp.where(hard, 0.0, more))
@@ -357,6 +357,16 @@ def _attempt(old: _Guard, plain: Array, increments: int, levels: int) -> tuple[A
         further = jnp.where(settled, further, old.applied)
         more = jnp.where(old.applied >= increments, further, more)
     return jnp.where(plain, 0.0, damping), jnp.where(plain, levels, more)
+
+
+def _shorter(old: _Guard) -> _Guard:
+    """State where a step is halved. Steps after it shrink because of that, not linearly."""
+    return old._replace(
+        spent=old.spent + 1,
+        cuts=old.cuts + 1,
+        whole=jnp.zeros_like(old.whole),
+        contraction=jnp.full_like(old.contraction, jnp.inf),
+    )
 
 
 def _accepted(
