@@ -71,6 +71,9 @@ about."""
 _NO_FRICTION = 1e-9
 """Friction that counts as none, in units of k and the arm's length."""
 
+_GRIP = 10.0
+"""Stiffness c of `slip`, in units of that of the arm up to the contact."""
+
 _CLEAR = 0.3
 """Deflection by all contact forces, as a fraction of the least gap, below which nothing is
 touched."""
@@ -87,9 +90,9 @@ class Contacts(Coupling):
     **Fields:** the `obstacles`, the `rod` and the position of its `base`; the stiffness k, `scale`;
     `flatness` and `lift` of `Surroundings`; the length b, `blur`, and the compliance c, `give`, and
     both to begin with, `first`; `loose`: 1 where the flatness is that of a second attempt;
-    the number of `steps`; the coefficients of `friction`, None without; `soft`: 1 where the gaps
-    give the forces; `traces`: what the contacts remember where the arm follows a path of inputs,
-    None without.
+    the number of `steps`; the coefficients of `friction` and the stiffness c of `slip` on each
+    step, `grip` (steps, ...), both None without; `soft`: 1 where the gaps give the forces;
+    `traces`: what the contacts remember where the arm follows a path of inputs, None without.
     """
 
     obstacles: tuple[Obstacle, ...]
@@ -104,6 +107,7 @@ class Contacts(Coupling):
     loose: Array
     steps: int = eqx.field(static=True)
     friction: Array | None = None
+    grip: Array | None = None
     soft: Array | None = None
     traces: Traces | None = None
     softens = True
@@ -188,8 +192,9 @@ class Contacts(Coupling):
         """Friction."""
         if self.friction is None or self.traces is None:
             return None
+        assert self.grip is not None
         least = _NO_FRICTION * self.scale * self.rod.length
-        return Rough(self.friction, self.scale, least, x[1], self.traces)
+        return Rough(self.friction, self.grip, least, x[1], self.traces)
 
     def dissipates(self) -> Array | None:
         if self.friction is None or self.traces is None:
@@ -242,7 +247,10 @@ class Contacts(Coupling):
             jnp.maximum(1 - (1 - self.give) * pushing, least),
             note.handed,
         )
-        return normal if note.slip is None else _with_slip(normal, note, self.scale, least)
+        if note.slip is None:
+            return normal
+        assert self.grip is not None
+        return _with_slip(normal, note, self.grip, least * self.grip / self.scale)
 
     def rows(self, at: ArmState, note: Touch, grid: Grid) -> Vector:
         """For each contact of one arm the wrenches at the nodes whose work over a change of strain
@@ -303,7 +311,7 @@ class Contacts(Coupling):
         return jax.tree.map(lambda x: x + 1 / (self.scale * problem.length), like)
 
 
-def _with_slip(normal: PointForces, touch: Touch, scale: Array, least: float) -> PointForces:
+def _with_slip(normal: PointForces, touch: Touch, grip: Array, least: Array) -> PointForces:
     """Contact forces with friction in two directions of each contact."""
     slip = touch.slip
     assert slip is not None
@@ -311,9 +319,9 @@ def _with_slip(normal: PointForces, touch: Touch, scale: Array, least: float) ->
 
     return PointForces(
         jnp.concatenate([normal.wrench, tangents], axis=1),
-        jnp.concatenate([normal.direction, tangents], axis=1),
+        jnp.concatenate([normal.direction, touch.slips], axis=1),
         jnp.concatenate([normal.cell] * 3, axis=1),
-        jnp.concatenate([normal.factors, kept * scale]),
+        jnp.concatenate([normal.factors, kept * grip]),
         jnp.concatenate([normal.corner, jnp.maximum(1 - kept, least)]),
         jnp.concatenate([normal.handed, jnp.zeros_like(kept)]),
         slip,
@@ -347,11 +355,13 @@ def contacts_of(scene: Scene, sections: CrossSections, grid: Grid) -> Contacts |
     length = jnp.sum(grid.h)
     bending = jnp.sum(grid.weight * softest(sections.stiffness)) / length
     flatness = _FLATNESS * scene.rod.outline(0.5 * scene.rod.length)
+    stiffness, friction = 3 * bending / length**3, _friction(scene.obstacles, grid.h.dtype)
+    ends = jnp.maximum(jnp.cumsum(grid.h, axis=0), grid.h[:1])
     return Contacts(
         scene.obstacles,
         scene.rod,
         base,
-        3 * bending / length**3,
+        stiffness,
         flatness,
         jnp.zeros_like(length),
         _LAST[0] * length,
@@ -359,7 +369,8 @@ def contacts_of(scene: Scene, sections: CrossSections, grid: Grid) -> Contacts |
         _first(scene, length),
         jnp.zeros_like(length),
         grid.h.shape[0],
-        _friction(scene.obstacles, grid.h.dtype),
+        friction,
+        None if friction is None else _GRIP * stiffness * (length / ends) ** 3,
     )
 
 

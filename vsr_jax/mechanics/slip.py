@@ -13,7 +13,9 @@ $$f = P(y), \quad y = f - c \Delta, \quad P(y) = y \min(1, \mu \lambda / |y|),$$
 
 the projection onto the disc of Coulomb's law, for any $c > 0$. Newton's method solves it with the
 unknown f, in the directions $t_1$ of y and $t_2 = n \times t_1$. The force on the arm is P(y), so
-that it keeps to Coulomb's law on the way, too.
+that it keeps to Coulomb's law on the way, too. c is ten times the stiffness of the arm up to the
+contact: with a much smaller one contacts that slip far are first taken to stick, which demands
+forces far beyond Coulomb's limit.
 
 **Source:** P. Alart and A. Curnier, A mixed formulation for frictional contact problems prone to
 Newton like solution methods, Computer Methods in Applied Mechanics and Engineering 92 (1991).
@@ -45,13 +47,13 @@ class Traces(NamedTuple):
 class Rough(NamedTuple):
     """Friction of obstacles.
 
-    **Fields:** the coefficients (obstacles, ...); the `scale` c [N/m]; the friction [N] that counts
-    as none, `least`; the unknown `force` [N] of each obstacle on each step (3, obstacles * steps,
-    ...); and what is remembered.
+    **Fields:** the coefficients (obstacles, ...); the stiffness c [N/m] on each step, `grip`
+    (steps, ...); the friction [N] that counts as none, `least`; the unknown `force` [N] of each
+    obstacle on each step (3, obstacles * steps, ...); and what is remembered.
     """
 
     friction: Array
-    scale: Array
+    grip: Array
     least: Array
     force: Array
     traces: Traces
@@ -62,7 +64,8 @@ class Slip(NamedTuple):
 
     **Fields:** `force` P(y) (3) and the `row` $f - P(y)$ (3); `lever` b (3); the directions `first`
     and `second` (3); `per_force`: derivative of f along the first one by the contact force, $\mu$
-    where it slips; `kept` (2): in both directions the derivative of P(y) by y.
+    where it slips; `kept` (2): in both directions the derivative of P(y) by y; `back` (3, 3):
+    $R_0 R^T$.
     """
 
     force: Array
@@ -72,6 +75,7 @@ class Slip(NamedTuple):
     second: Array
     per_force: Array
     kept: Array
+    back: Array
 
     def along(self, rows: Array) -> Array:
         """Components (2, ...) of vectors (3, ...) in both directions."""
@@ -88,6 +92,11 @@ class Slip(NamedTuple):
     def moment(self) -> Array:
         """Moment about the axis (3)."""
         return cross(self.lever, self.force)
+
+    def turning(self, x: Array) -> Array:
+        r"""What gives the change of $\Delta$ in a direction (3, ...) as the section turns (3, ...)
+        about the axis."""
+        return cross(self.lever, matvec(transpose(self.back), x))
 
 
 def slip_of(
@@ -112,7 +121,7 @@ def slip_of(
     back = matmul(rough.traces.rotation, transpose(rotation))
     back = jnp.sum(values * back[:, :, :, None], axis=2)
     moved = place - _old_place(rough.traces, cumulative, grid) + lever - matvec(back, lever)
-    y = friction - rough.scale * moved
+    y = friction - rough.grip * moved
     y = y - jnp.sum(normal * y, axis=0) * normal
     limit = rough.friction[:, None] * jnp.maximum(force, 0.0)
     square = jnp.sum(y**2, axis=0)
@@ -131,6 +140,7 @@ def slip_of(
         cross(normal, first),
         jnp.where(slips & pressed, rough.friction[:, None], 0.0),
         jnp.stack([jnp.where(slips, 0.0, share), share]),
+        back,
     )
 
 

@@ -121,6 +121,17 @@ class Touch(NamedTuple):
         both = self.slip.first, self.slip.second
         return jnp.concatenate([self._at_outline(x) for x in both], axis=1)
 
+    @property
+    def slips(self) -> Array:
+        """As `tangents`, wrenches whose work over a motion is the slip in both directions."""
+        slip = self.slip
+        assert slip is not None
+        both = [
+            jnp.concatenate([cross(self.lever, x) + slip.turning(x), x])
+            for x in (slip.first, slip.second)
+        ]
+        return jnp.concatenate(both, axis=1)
+
     def _at_outline(self, force: Array) -> Array:
         """Wrench of a force at the outline about the end of the cell."""
         assert self.slip is not None
