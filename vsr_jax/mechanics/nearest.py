@@ -116,7 +116,7 @@ class _Curves(NamedTuple):
 
     def begun(self) -> tuple["_Curves", Array]:
         """The curves with less epsilon the more the gaps bulge, and the best samples of places."""
-        samples = np.linspace(0.0, 1.0, _SAMPLES)
+        samples = np.linspace(0.0, 1.0, _SAMPLES).tolist()
         gaps = jax.vmap(self.gaps)(jnp.asarray(samples, self.h.dtype))
         middle = gaps[_SAMPLES // 2]
         bulge = jnp.maximum(0.5 * (gaps[0] + gaps[-1]) - middle, 0.0) / self.epsilon

@@ -202,13 +202,9 @@ def touch_slopes(touch: Touch) -> Array:
     moved = once(jnp.concatenate([turning + cross(touch.lever, force), force]))
     above, below = matmul(d, touch.bend), matmul(touch.bend, d)
     corner = matmul(skew(touch.push) - above, d)
-    whole = jnp.concatenate(
-        [
-            jnp.concatenate([corner, above], axis=1),
-            jnp.concatenate([-below, touch.bend], axis=1),
-        ]
-    )
-    return once(whole + (touch.slide * moved)[:, None] * moved)
+    top = jnp.concatenate([corner, above], axis=1)
+    bent = jnp.concatenate([top, jnp.concatenate([-below, touch.bend], axis=1)])
+    return bent + (touch.slide * moved)[:, None] * moved
 
 
 def at_cells(cell: Array, slopes: Array) -> Array:
@@ -225,7 +221,8 @@ def to_cells(x: Array, axis: int) -> Array:
     stages = x.shape[axis] - 1
     room = [(0, 0)] * x.ndim
     room[axis], room[axis + 1] = (stages - 1, 0), (0, 1)
-    return lax.slice_in_dim(x, 1, None, axis=axis) + jnp.pad(ahead, room)
+    # without `once` XLA computes all again for the padded part
+    return lax.slice_in_dim(x, 1, None, axis=axis) + once(jnp.pad(ahead, room))
 
 
 def from_cells(x: Array, axis: int) -> Array:
@@ -234,7 +231,7 @@ def from_cells(x: Array, axis: int) -> Array:
     before = lax.slice_in_dim(before, 0, x.shape[axis + 1] - 1, axis=axis + 1)
     room = [(0, 0)] * x.ndim
     room[axis + 1] = (1, 0)
-    return jnp.concatenate([jnp.pad(before, room), x], axis=axis)
+    return once(jnp.concatenate([jnp.pad(before, room), x], axis=axis))
 
 
 def _cell_of(sigma: Array, stages: int) -> Array:
