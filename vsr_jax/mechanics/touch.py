@@ -216,13 +216,13 @@ def at_cells(cell: Array, slopes: Array) -> Array:
 def to_cells(x: Array, axis: int) -> Array:
     """What acts at the ends of the cells (..., stages + 1, steps, *arms), the first of them the
     start of the step, as (..., stages, steps, *arms). Nothing moves the start of the arm."""
+    x = once(x)  # XLA would compute a sum again for each of its parts, without vectors
     ahead = lax.slice_in_dim(x, 0, 1, axis=axis)
     ahead = lax.slice_in_dim(ahead, 1, None, axis=axis + 1)
     stages = x.shape[axis] - 1
     room = [(0, 0)] * x.ndim
     room[axis], room[axis + 1] = (stages - 1, 0), (0, 1)
-    # without `once` XLA computes all again for the padded part
-    return lax.slice_in_dim(x, 1, None, axis=axis) + once(jnp.pad(ahead, room))
+    return once(lax.slice_in_dim(x, 1, None, axis=axis) + jnp.pad(ahead, room))
 
 
 def from_cells(x: Array, axis: int) -> Array:
