@@ -217,7 +217,7 @@ def _before(free: tuple[int, ...], end: tuple[Array, Array], hinge: Hinge) -> tu
     hinge = jax.tree.map(once, hinge)
     size, w = len(hinge.stiff), hinge.width
     load, given = (_halves(x) for x in (hinge.load, hinge.given))
-    beyond = _before_link(tuple(x + y for x, y in zip(end, load, strict=True)), hinge.lever)
+    beyond = _before_link((end[0] + load[0], end[1] + load[1]), hinge.lever)
     right = tuple(once(x + y) for x, y in zip(beyond, given, strict=True))[: size // 3]
     D = [
         [
@@ -237,7 +237,7 @@ def _before(free: tuple[int, ...], end: tuple[Array, Array], hinge: Hinge) -> tu
         turning = once(w * (Q - half))
         parts = [_product(columns(turning, 3 * i, 3 * i + 3), x) for i, x in enumerate(X)]
         start.append(once(sum(parts, Q)))
-    start = _before_link(tuple(start), hinge.lever)
+    start = _before_link((start[0], start[1]), hinge.lever)
     Q = columns(beyond[0], 0, 3)
     return start, (jnp.concatenate(X), negative, asymmetry_of(Q, None, compliance))
 
@@ -285,7 +285,8 @@ def _before_link(beyond: tuple[Array, Array], lever: Array) -> tuple[Array, Arra
     its start."""
     moment, force = beyond
     moment = once(moment + _product(columns(lever, 0, 3), force))
-    return tuple(once(x - _product(columns(x, 3, 6), lever)) for x in (moment, force))
+    moved, pushed = (once(x - _product(columns(x, 3, 6), lever)) for x in (moment, force))
+    return moved, pushed
 
 
 def _carried(beyond: Array, link: Array) -> Array:

@@ -39,9 +39,6 @@ from .nearest import nearest_points
 from .pose_terms import starts_of
 from .slip import Rough, Slip, slip_of
 
-_SAMPLES, _ITERATIONS = 5, 8
-"""Points of a step from which the nearest one starts, and bound on the Newton steps from it."""
-
 
 class Surroundings(NamedTuple):
     r"""The obstacles around an arm.
