@@ -46,6 +46,7 @@ from ..numerics.stacked import (
     rows,
     skew,
     stack,
+    total,
     transpose,
     turned,
 )
@@ -62,24 +63,23 @@ from .reaction import Reaction, Slopes
 
 class Hinge(NamedTuple):
     r"""The hinge at a node, of size 3 if only bending and twist are free, else 6, and the loads at
-    the end of its cell.
+    the end of its cell. All that the passes need is prepared for all hinges at once.
 
-    - `width` w; `link`: vector to the end of the cell; `rotation` of the section.
-    - `stiff`: $H + H_w$; `wrench` W; `right`: b.
-    - `load` (6): wrench of the loads at the end; `jump`: derivative by the motion there, None
-      without such loads; `push`: right side of the wrench there, None without one.
+    - `width` w; `link`: vector d to the end of the cell; `rotation` of the section.
+    - `lever`: $(\tilde d, 0)$, shape (3, 7).
+    - `stiff`: $H + H_w$; `given`: $(-\tfrac12 A, b)$, shape (6, 7).
+    - `load`: derivative by the motion at the end of the cell of the loads there, and their right
+      side, shape (6, 7).
     - `flexible`: 1, or 0 where the section is rigid; None without rigid pieces.
     """
 
     width: Array
     link: Array
     rotation: Array
+    lever: Array
     stiff: Array
-    wrench: Array
-    right: Array
+    given: Array
     load: Array
-    jump: Array | None
-    push: Array | None
     flexible: Array | None
 
 
@@ -102,8 +102,10 @@ def eliminate_poses(
     arms = jnp.broadcast_shapes(*(x.shape[2:] for x in (*H[0], *right, grid.weight, along.axis[0])))
     hinges = _hinges(H, right, along, slopes, grid, free, flexible, push, arms)
     hinges = jax.tree.map(lambda x: jnp.moveaxis(x, -1 - len(arms), 0), hinges)
-    nothing = jnp.zeros((6, 7, *arms), hinges.width.dtype)
-    _, (X, negative, asymmetry) = lax.scan(partial(_before, free), nothing, hinges, reverse=True)
+    none = jnp.zeros((3, 7, *arms), hinges.width.dtype)
+    _, (X, negative, asymmetry) = lax.scan(
+        partial(_before, free), (none, none), hinges, reverse=True
+    )
 
     def forward(z: Array, hinge: tuple) -> tuple[Array, Array]:
         X, link, width = jax.tree.map(once, hinge)
@@ -188,7 +190,7 @@ def _hinges(
         jump = cells if jump is None else jump + cells
     if slopes.density is not None:
         density = 0.5 * w * listed(slopes.density)
-        density = _before_link(density, -reach) + _before_link(after(density), after(reach))
+        density = _carried(density, -reach) + _carried(after(density), after(reach))
         jump = density if jump is None else jump + density
     b, stiff = turned(R, stack(tuple(listed(x) for x in right))), _seen_from(R, block(0, 0))
     even = matmul(skew(reach), skew(n))
@@ -196,40 +198,48 @@ def _hinges(
     if max(free) > 2:
         mixed, linear = (_seen_from(R, block(i, 3)) for i in (0, 3))
         stiff = _blocks(stiff, mixed, transpose(mixed), linear)
-    push, flexible = (None if x is None else listed(x) for x in (push, flexible))
-    return Hinge(w, reach, R, stiff, wrench, b[: len(stiff)], load, jump, push, flexible)
+    load = _half(load)
+    load = _blocks(-load[:3, :3], load[:3, 3:], -load[3:, :3], load[3:, 3:])
+    load = load if jump is None else load + jump
+    load = _beside(load, jnp.zeros_like(wrench) if push is None else listed(push))
+    given, lever = _beside(-_half(wrench), b), skew(reach)
+    lever = jnp.pad(lever, [(0, 0), (0, 4), *[(0, 0)] * (lever.ndim - 2)])
+    flexible = None if flexible is None else listed(flexible)
+    return Hinge(w, reach, R, lever, stiff, given, load, flexible)
 
 
-def _before(free: tuple[int, ...], end: Array, hinge: Hinge) -> tuple[Array, tuple]:
-    r"""One cell: from $\hat Q$ and q (6, 7) beyond its end to those at its start; the affine strain
-    by the motion of the section of the hinge before it (size, 7), the number of negative pivots and
-    the asymmetry."""
+def _before(free: tuple[int, ...], end: tuple[Array, Array], hinge: Hinge) -> tuple[tuple, tuple]:
+    r"""One cell: from $\hat Q$ and q beyond its end to those at its start, the moments (3, 7) and
+    the forces; the affine strain by the motion of the section of the hinge before it (size, 7), the
+    number of negative pivots and the asymmetry.
+
+    Moments and forces are apart, since XLA does not fuse what joins arrays."""
     hinge = jax.tree.map(once, hinge)
     size, w = len(hinge.stiff), hinge.width
-    half = _half(hinge.wrench)
-    load = -_half(hinge.load)
-    load = jnp.concatenate([columns(load, 0, 3), -columns(load, 3, 6)], axis=1)
-    if hinge.jump is not None:
-        load = load + hinge.jump
-    constant = end[:, 6]
-    if hinge.push is not None:
-        constant = constant + hinge.push
-    end = jnp.concatenate([columns(end, 0, 6) + load, constant[:, None]], axis=1)
-    beyond = _before_link(end, hinge.link)
-    Q = columns(beyond, 0, 6)
-    given = columns(beyond, 0, 7)[:size] + jnp.concatenate(
-        [transpose(half[:, :size]), hinge.right[:, None]], axis=1
-    )
-    X, negative, compliance = _solved(
-        hinge.stiff - w * Q[:size, :size], given, hinge.rotation, free
-    )
+    load, given = (_halves(x) for x in (hinge.load, hinge.given))
+    beyond = _before_link((end[0] + load[0], end[1] + load[1]), hinge.lever)
+    right = tuple(once(x + y) for x, y in zip(beyond, given, strict=True))[: size // 3]
+    D = [
+        [
+            hinge.stiff[3 * i : 3 * i + 3, 3 * j : 3 * j + 3] - w * beyond[i][:, 3 * j : 3 * j + 3]
+            for j in range(size // 3)
+        ]
+        for i in range(size // 3)
+    ]
+    X, negative, compliance = _solved(D, right, hinge.rotation, free)
     if hinge.flexible is not None:
         bends = hinge.flexible > 0
-        X, compliance = (jnp.where(bends, x, 0.0) for x in (X, compliance))
+        X = tuple(jnp.where(bends, x, 0.0) for x in X)
+        compliance = jnp.where(bends, compliance, 0.0)
         negative = jnp.where(bends, negative, 0)
-    start = beyond + matmul(w * (Q[:, :size] + half[:, :size]), X)
-    start = _before_link(start, hinge.link)
-    return start, (X, negative, asymmetry_of(Q[:3, :3], None, compliance))
+    start = []
+    for Q, half in zip(beyond, given, strict=True):
+        turning = once(w * (Q - half))
+        parts = [_product(columns(turning, 3 * i, 3 * i + 3), x) for i, x in enumerate(X)]
+        start.append(once(sum(parts, Q)))
+    start = _before_link((start[0], start[1]), hinge.lever)
+    Q = columns(beyond[0], 0, 3)
+    return start, (jnp.concatenate(X), negative, asymmetry_of(Q, None, compliance))
 
 
 def _half(wrench: Array) -> Array:
@@ -238,21 +248,23 @@ def _half(wrench: Array) -> Array:
     return _blocks(m, n, n, jnp.zeros_like(m))
 
 
-def _solved(D: Array, right: Array, R: Array, free: tuple[int, ...]) -> tuple[Array, Array, Array]:
-    """Solution of the system D of a hinge for the free strains of a section with the rotation R,
-    zero for the others, the number of negative eigenvalues of D, and the inverse of its bending
-    block."""
+def _solved(
+    D: list[list[Array]], right: tuple[Array, ...], R: Array, free: tuple[int, ...]
+) -> tuple[tuple[Array, ...], Array, Array]:
+    """Solution of the system of a hinge, in blocks, for the free strains of a section with the
+    rotation R, zero for the others, the number of negative eigenvalues of D, and the inverse of its
+    bending block."""
     bent, stretched = tuple(i for i in free if i < 3), tuple(i - 3 for i in free if i > 2)
     if not stretched:
-        compliance, negative = _inverse(D, R, bent)
-        return matmul(compliance, right), negative, compliance
-    b, below, d = D[:3, 3:], D[3:, :3], D[3:, 3:]
+        compliance, negative = _inverse(D[0][0], R, bent)
+        return (matmul(compliance, right[0]),), negative, compliance
+    (a, b), (below, d) = D
     flexibility, first = _inverse(d, R, stretched)
     across = matmul(b, flexibility)
-    compliance, second = _inverse(D[:3, :3] - matmul(across, below), R, bent)
-    bending = matmul(compliance, right[:3] - matmul(across, right[3:]))
-    stretch = matmul(flexibility, right[3:] - matmul(below, bending))
-    return jnp.concatenate([bending, stretch]), first + second, compliance
+    compliance, second = _inverse(a - _product(across, below), R, bent)
+    bending = matmul(compliance, once(right[0] - _product(across, right[1])))
+    stretch = matmul(flexibility, once(right[1] - _product(below, bending)))
+    return (bending, stretch), first + second, compliance
 
 
 def _inverse(matrix: Array, R: Array, places: tuple[int, ...]) -> tuple[Array, Array]:
@@ -268,13 +280,37 @@ def _seen_from(R: Array, matrix: Array) -> Array:
     return matmul(matmul(R, matrix), transpose(R))
 
 
-def _before_link(beyond: Array, link: Array) -> Array:
-    """What acts at the end of a link by the motion there (6, 6 or 7, ...), at its start."""
-    d = link[:, None]
+def _before_link(beyond: tuple[Array, Array], lever: Array) -> tuple[Array, Array]:
+    """What acts at the end of a link by the motion there, its moments and forces (3, 7, ...), at
+    its start."""
+    moment, force = beyond
+    moment = once(moment + _product(columns(lever, 0, 3), force))
+    moved, pushed = (once(x - _product(columns(x, 3, 6), lever)) for x in (moment, force))
+    return moved, pushed
+
+
+def _carried(beyond: Array, link: Array) -> Array:
+    """As `_before_link`, of derivatives (6, 6, ...) alone."""
+    d = skew(link)
     above, below = rows(beyond, 0, 3), rows(beyond, 3, 6)
-    beyond = once(jnp.concatenate([above + cross(d, below), below]))
-    turning = transpose(columns(beyond, 0, 3)) + cross(d, transpose(columns(beyond, 3, 6)))
-    return once(jnp.concatenate([transpose(turning), columns(beyond, 3, beyond.shape[1])], axis=1))
+    beyond = jnp.concatenate([above + matmul(d, below), below])
+    turning = columns(beyond, 0, 3) - matmul(columns(beyond, 3, 6), d)
+    return jnp.concatenate([turning, columns(beyond, 3, 6)], axis=1)
+
+
+def _product(a: Array, b: Array) -> Array:
+    """Product of matrices, to be part of a sum."""
+    return total(a[:, :, None] * b[None], 1)
+
+
+def _halves(x: Array) -> tuple[Array, Array]:
+    """The rows of moments and those of forces."""
+    return rows(x, 0, 3), rows(x, 3, 6)
+
+
+def _beside(matrix: Array, column: Array) -> Array:
+    """A matrix with a column more."""
+    return jnp.concatenate([matrix, column[:, None]], axis=1)
 
 
 def _blocks(a: Array, b: Array, below: Array, d: Array) -> Array:

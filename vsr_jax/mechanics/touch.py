@@ -23,8 +23,7 @@ force at s acts on node j with the share $a_j(s) / a_j(1)$, so that its work is 
 positions: but for $\epsilon$ the balance is the gradient of a discrete energy.
 """
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -34,14 +33,11 @@ from jaxtyping import Array
 
 from ..arm.obstacles import Obstacle
 from ..arm.rod import Rod
-from ..numerics.batching import arms_in
 from ..numerics.quadrature import Grid, gauss_legendre, interpolation
-from ..numerics.stacked import columns, cross, matmul, once, rows, skew, total
+from ..numerics.stacked import cross, matmul, once, rows, skew, total
+from .nearest import nearest_points
 from .pose_terms import starts_of
 from .slip import Rough, Slip, slip_of
-
-_SAMPLES, _ITERATIONS = 5, 8
-"""Points of a step from which the nearest one starts, and bound on the Newton steps from it."""
 
 
 class Surroundings(NamedTuple):
@@ -70,11 +66,12 @@ class Touch(NamedTuple):
 
     **Fields:** `gap` [m], and `raised` by the term in epsilon; `normal` (3) and `place` (3) of the
     contact in the world; `sigma`, its place in the step; `shares` (stages) of a force there for the
-    nodes of the step; `force` [N]; `slip`: friction, None without; `slope` (6, 6): derivative of
-    the wrench by the motion of the section, at a given force; `cell` (stages + 1): 1 for that end
-    of the cells of the nodes which is nearest, the first of them the start of the step; and `lever`
-    (3) from there; `handed`: 1 or -1 where the force of a step is handed on to the next or the last
-    one, since the nearest point is not in it, else 0.
+    nodes of the step; `force` [N]; `slip`: friction, None without; `bend` (3, 3): derivative of the
+    force by the displacement there, and `slide` times the product of `moved` (6) with itself that
+    by the motion of the section, as the contact slides, at a given force; `cell` (stages + 1): 1
+    for that end of the cells of the nodes which is nearest, the first of them the start of the
+    step; and `lever` (3) from there; `handed`: 1 or -1 where the force of a step is handed on to
+    the next or the last one, since the nearest point is not in it, else 0.
     """
 
     gap: Array
@@ -85,7 +82,9 @@ class Touch(NamedTuple):
     shares: Array
     force: Array
     slip: Slip | None
-    slope: Array
+    bend: Array
+    moved: Array
+    slide: Array
     cell: Array
     lever: Array
     handed: Array
@@ -138,44 +137,28 @@ class Touch(NamedTuple):
         return jnp.concatenate([cross(self.lever + self.slip.lever, force), force])
 
 
-class _Nearest(NamedTuple):
-    """The nearest point of one step: place in the step, gap there without and with the term in
-    epsilon, radius of the outline, normal, position, and the matrix of `Touch.slope` per force; 1
-    or -1 where points beyond the end or the start of the step are nearer, else 0."""
-
-    sigma: Array
-    gap: Array
-    raised: Array
-    outline: Array
-    normal: Array
-    place: Array
-    slope: Array
-    nearer: Array
-
-
 def touch_of(axis: Array, rotation: Array, grid: Grid, around: Surroundings) -> Touch:
     """Contact for the axis p' (3, stages, steps, *arms) and the rotations at the nodes."""
     starts = starts_of(around.base, axis, grid)
-    near = _of_all(
-        around.obstacles, (around.rod, around.flatness, starts, axis, grid.start, grid.h)
-    )
+    near = nearest_points(around.obstacles, around.rod, around.flatness, starts, axis, grid)
     # empty steps, all at one place, touch nothing
     lift = around.lift + jnp.where(grid.h > 0, 0.0, 1e3 * around.rod.length)
     gap, raised = near.gap + lift, near.raised + lift
     handed = _handed(near.nearer, grid.h > 0)
-    force, slope = around.force.reshape(gap.shape), near.slope
+    force = around.force.reshape(gap.shape)
     if around.soft is not None:
         handed = jnp.where(around.soft > 0, 0.0, handed)
     force = (1 - jnp.abs(handed)) * force + received(handed, force)
+    bend = near.bend
     if around.soft is None:
-        slope = force * slope
+        bend = force * bend
     else:
         root = jnp.sqrt(raised**2 + around.width**2)
         penalty = 0.5 * around.stiffness * (root - raised)
         rate = 0.5 * around.stiffness * (raised / root - 1)
         force = jnp.where(around.soft > 0, penalty, force)
-        push = jnp.where(around.soft > 0, rate, 0.0) * near.normal[:, None] * near.normal[None]
-        slope = (force * slope).at[3:, 3:].add(push)
+        rate = jnp.where(around.soft > 0, rate, 0.0)
+        bend = force * bend + rate * near.normal[:, None] * near.normal
     cumulative, weights = _weights(near.sigma, grid.X.shape[0])
     slip = None
     if around.rough is not None:
@@ -196,7 +179,9 @@ def touch_of(axis: Array, rotation: Array, grid: Grid, around: Surroundings) -> 
         shares,
         force,
         slip,
-        slope,
+        bend,
+        near.moved,
+        force * near.slide,
         cell,
         lever,
         handed,
@@ -220,12 +205,14 @@ def contact_wrenches(touch: Touch) -> Array:
 def touch_slopes(touch: Touch) -> Array:
     """Derivatives (6, 6, obstacles, steps, *arms) of the contact wrenches by the motions of the
     ends of their cells."""
-    d, f = skew(touch.lever), skew(touch.push)
-    turned, moved = columns(touch.slope, 0, 3), columns(touch.slope, 3, 6)
-    slope = jnp.concatenate([turned - matmul(moved, d), moved], axis=1)
-    moment = rows(slope, 0, 3) + matmul(d, rows(slope, 3, 6))
-    turning = jnp.concatenate([matmul(f, d), jnp.zeros_like(d)], axis=1)
-    return once(jnp.concatenate([moment + turning, rows(slope, 3, 6)]))
+    d = skew(touch.lever)
+    turning, force = rows(touch.moved, 0, 3), rows(touch.moved, 3, 6)
+    moved = once(jnp.concatenate([turning + cross(touch.lever, force), force]))
+    above, below = matmul(d, touch.bend), matmul(touch.bend, d)
+    corner = matmul(skew(touch.push) - above, d)
+    top = jnp.concatenate([corner, above], axis=1)
+    bent = jnp.concatenate([top, jnp.concatenate([-below, touch.bend], axis=1)])
+    return bent + (touch.slide * moved)[:, None] * moved
 
 
 def at_cells(cell: Array, slopes: Array) -> Array:
@@ -237,12 +224,13 @@ def at_cells(cell: Array, slopes: Array) -> Array:
 def to_cells(x: Array, axis: int) -> Array:
     """What acts at the ends of the cells (..., stages + 1, steps, *arms), the first of them the
     start of the step, as (..., stages, steps, *arms). Nothing moves the start of the arm."""
+    x = once(x)  # XLA would compute a sum again for each of its parts, without vectors
     ahead = lax.slice_in_dim(x, 0, 1, axis=axis)
     ahead = lax.slice_in_dim(ahead, 1, None, axis=axis + 1)
     stages = x.shape[axis] - 1
     room = [(0, 0)] * x.ndim
     room[axis], room[axis + 1] = (stages - 1, 0), (0, 1)
-    return lax.slice_in_dim(x, 1, None, axis=axis) + jnp.pad(ahead, room)
+    return once(lax.slice_in_dim(x, 1, None, axis=axis) + jnp.pad(ahead, room))
 
 
 def from_cells(x: Array, axis: int) -> Array:
@@ -251,7 +239,7 @@ def from_cells(x: Array, axis: int) -> Array:
     before = lax.slice_in_dim(before, 0, x.shape[axis + 1] - 1, axis=axis + 1)
     room = [(0, 0)] * x.ndim
     room[axis + 1] = (1, 0)
-    return jnp.concatenate([jnp.pad(before, room), x], axis=axis)
+    return once(jnp.concatenate([jnp.pad(before, room), x], axis=axis))
 
 
 def _cell_of(sigma: Array, stages: int) -> Array:
@@ -307,129 +295,3 @@ def _by_nodes(powers: list[Array]) -> Array:
     stages = len(powers)
     b = jnp.asarray(interpolation(stages), powers[0].dtype)
     return jnp.stack([sum(b[p, j] * powers[p] for p in range(stages)) for j in range(stages)])
-
-
-def _nearest(
-    obstacle: Obstacle, rod: Rod, flatness: Array, start: Array, axis: Array, X: Array, h: Array
-) -> _Nearest:
-    """The nearest point of one step of one arm."""
-    step = _Step(obstacle, rod, flatness, start, axis, X, h).faded()
-    fixed = lax.stop_gradient(step)
-    s = _search(fixed)
-    rate, curvature = fixed.slope(s), fixed.curvature(s)
-    inside = (s > 0) & (s < 1) & (curvature > 0)
-    curvature = jnp.where(inside, curvature, 1.0)
-    # its derivative by the shape is that of the root of the slope
-    s = jnp.clip(s - jnp.where(inside, step.slope(s) / curvature, 0.0), 0.0, 1.0)
-    r, along = jax.jvp(step.place, (s,), (jnp.ones_like(s),))
-    normal, turn = jax.jvp(jax.grad(obstacle.distance), (r,), (along,))
-    bend = once(jax.jacfwd(jax.grad(obstacle.distance))(r))
-    moved = once(jnp.concatenate([jnp.cross(along, normal), turn]))
-    slide = once(jnp.where(inside, -1 / curvature, 0.0) * moved)
-    slope = slide[:, None] * moved[None]
-    at_end, at_start = (s >= 1) & (rate < 0), (s <= 0) & (rate > 0)
-    nearer = at_end.astype(h.dtype) - at_start.astype(h.dtype)
-    slope = slope.at[3:, 3:].add(bend)
-    outline = rod.outline(X + s * h)
-    return _Nearest(s, step.gap(s), step.lifted(s), outline, normal, r, slope, nearer)
-
-
-class _Step(NamedTuple):
-    """One step of one arm near an obstacle."""
-
-    obstacle: Obstacle
-    rod: Rod
-    epsilon: Array
-    start: Array
-    axis: Array
-    X: Array
-    h: Array
-
-    def place(self, s: Array) -> Array:
-        """Position at a place in the step."""
-        return self.start + self.h * (self.axis @ _weights(s, self.axis.shape[1])[0])
-
-    def gap(self, s: Array) -> Array:
-        """Gap there."""
-        return self.obstacle.distance(self.place(s)) - self.rod.outline(self.X + s * self.h)
-
-    def faded(self) -> "_Step":
-        """The step with less epsilon the more the gap bulges."""
-        first, middle, last = jax.vmap(self.gap)(jnp.array([0.0, 0.5, 1.0], self.h.dtype))
-        bulge = jnp.maximum(0.5 * (first + last) - middle, 0.0) / self.epsilon
-        return self._replace(epsilon=self.epsilon * jnp.exp(-(bulge**2)))
-
-    def lifted(self, s: Array) -> Array:
-        """Gap with the term in epsilon."""
-        return self.gap(s) + self.epsilon * (2 * s - 1) ** 2
-
-    def slope(self, s: Array) -> Array:
-        """Its derivative."""
-        return jax.grad(self.lifted)(s)
-
-    def curvature(self, s: Array) -> Array:
-        """Its second derivative."""
-        return jax.grad(self.slope)(s)
-
-
-def _search(step: _Step) -> Array:
-    """The place in a step where its `lifted` gap is least, by Newton's method from the least of
-    some samples."""
-    samples = jnp.linspace(0.0, 1.0, _SAMPLES, dtype=step.h.dtype)
-    first = samples[jnp.argmin(jax.vmap(step.lifted)(samples))]
-    tolerance = jnp.finfo(step.h.dtype).eps ** 0.5
-
-    def closer(state: tuple) -> tuple:
-        s, _, count = state
-        slope, curvature = step.slope(s), step.curvature(s)
-        change = jnp.where(curvature > 0, slope / curvature, jnp.sign(slope))
-        next = jnp.clip(s - jnp.clip(change, -0.25, 0.25), 0.0, 1.0)
-        return next, jnp.abs(next - s), count + 1
-
-    def going(state: tuple) -> Array:
-        return (state[1] > tolerance) & (state[2] < _ITERATIONS)
-
-    return lax.while_loop(going, closer, (first, jnp.ones_like(first), jnp.array(0)))[0]
-
-
-def _of_all(obstacles: tuple[Obstacle, ...], arm: tuple) -> _Nearest:
-    """The nearest points of all steps to all obstacles, arrays (..., obstacles, steps, *arms).
-
-    Those whose numbers have the same shapes share one program."""
-    alike: dict[Any, list[int]] = {}
-    for i, obstacle in enumerate(obstacles):
-        leaves, form = jax.tree.flatten(obstacle)
-        alike.setdefault((form, tuple(jnp.shape(leaf) for leaf in leaves)), []).append(i)
-    found = [
-        jax.vmap(lambda one: _each(_nearest, one, *arm))(
-            jax.tree.map(lambda *x: jnp.stack(x), *(obstacles[i] for i in places))
-        )
-        for places in alike.values()
-    ]
-    order = np.argsort(np.concatenate(list(alike.values())))
-    near = jax.tree.map(lambda *x: jnp.concatenate(x)[order], *found)
-    ends = jnp.ndim(near.sigma) - 1  # the obstacles come before the axes of steps and arms
-    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, x.ndim - 1 - ends), near)
-
-
-def _each(
-    function: Callable,
-    obstacle: Obstacle,
-    rod: Rod,
-    flatness: Array,
-    starts: Array,
-    axis: Array,
-    X: Array,
-    h: Array,
-) -> Any:
-    """A function of every step of every arm, its axes in front of those of steps and arms."""
-    behind = h.ndim - 1
-    of_arm = jax.vmap(function, (None, None, None, 1, 2, 0, 0), -1)
-    arguments = obstacle, rod, flatness, starts, axis, X, h
-    if behind:
-        arms = arms_in(arguments, behind)
-        arguments = jax.tree.map(
-            lambda x: jnp.broadcast_to(x, (*x.shape[: x.ndim - behind], *arms)), arguments
-        )
-        of_arm = jax.vmap(of_arm, -1, -1)
-    return of_arm(*arguments)
