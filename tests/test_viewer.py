@@ -133,7 +133,7 @@ def test_a_dragged_tip_is_reached_with_the_least_change_of_inputs():
         np.linalg.norm(np.asarray(u) - start.setting.inputs)
         for u in (answer.setting.inputs, free.inputs)
     ]
-    assert change[0] < change[1]
+    assert change[0] <= change[1] * (1 + 1e-9)  # the other search may find the same inputs
 
     away = session.drag(np.array([0.1, 0.3, 0.0]))
     assert re.fullmatch(r"out of reach, the tip is [\d.]+ mm away", away.note)
