@@ -406,9 +406,18 @@ def reaction_change(change: Array, along: Reaction, slopes: Slopes, grid: Grid) 
     return turned(transpose(R), jnp.concatenate([dm, rows(delta, 3, 6) - cross(theta, n)]))
 
 
-def react_at(xi: Vector, grid: Grid, loads: Loading, X: Array, forces: Forces = ()) -> Vector:
+def react_at(
+    xi: Vector,
+    grid: Grid,
+    loads: Loading,
+    X: Array,
+    forces: Forces = (),
+    *,
+    smooth: bool = False,
+) -> Vector:
     r"""Reaction $\Lambda$ at abscissas X, six component arrays of their shape, from the strain at
-    the nodes and the `forces` of the threads at their start."""
+    the nodes and the `forces` of the threads at their start. `smooth`: with each contact force
+    spread over its step."""
     along = react(xi, grid, loads, forces)
     step, sigma = locate(grid, X)
     k = stack(xi[:3])[:, :, step]
@@ -417,12 +426,8 @@ def react_at(xi: Vector, grid: Grid, loads: Loading, X: Array, forces: Forces = 
     first = float(gauss_legendre(grid.X.shape[0])[0][0])
     since, q = along.world[:, 0, step], along.density
     world = since + within(q, grid, step, first) - within(q, grid, step, sigma)
-    touch = along.touch
-    if touch is not None:  # a contact force acts before its place, not by its share of the node
-        before = (sigma < touch.sigma[:, step]) - touch.shares[0][:, step]
-        parts = (jnp.zeros_like(touch.push) if touch.moment is None else touch.moment), touch.push
-        there = jnp.concatenate(parts)[:, :, step]
-        world = world + jnp.sum(before * there, axis=1)
+    if along.touch is not None:
+        world = world + along.touch.carried(step, sigma, smooth)
     return components(turned(transpose(R), world))
 
 

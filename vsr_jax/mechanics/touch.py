@@ -9,8 +9,12 @@ with the distance d to the obstacle and the polynomial r(s) through the step. Th
 makes it unique where the arm lies along a surface; the least value is that which contact keeps from
 being negative, since its derivative is that of the gap at a given place. Where the gap has a clear
 minimum $\epsilon$ vanishes: with the bulge b of the gap over the step, its end values on average
-less the middle one, $\epsilon = \epsilon_0 \exp(-(b / \epsilon_0)^2)$ for b > 0. The sum is then
-convex in s at least as much as without bulge. $\epsilon_0$ is 1e-3 of the outline; where a first
+less the middle one, and the half a of their difference,
+
+$$\epsilon = \epsilon_0 \exp(-\max(b / \epsilon_0, 0)^2 - \max(|a| / \epsilon_0 - 2, 0)^2).$$
+
+The bulge makes the sum convex in s at least as much as without it; with $|a| > 2 \epsilon$ the
+least value is at an end, whatever $\epsilon$ is. $\epsilon_0$ is 1e-3 of the outline; where a first
 attempt to solve fails, it is the bulge $h^2 / (8 L)$ on a step of length h of a gap that curves by
 1 / L, with the length L of the arm. The contact force is $\lambda n$ with $n = \nabla d$, and
 friction as in `slip`.
@@ -20,7 +24,9 @@ end, and the step beyond has a nearest point of its own, that step receives the 
 
 The position r(s) is an integral of the axis with weights $a_j(s)$ for the nodes of the step. A
 force at s acts on node j with the share $a_j(s) / a_j(1)$, so that its work is that of the discrete
-positions: but for $\epsilon$ the balance is the gradient of a discrete energy.
+positions: but for $\epsilon$ the balance is the gradient of a discrete energy. Positions between
+the nodes follow from the polynomial through these shares (`Touch.carried`): a jump of the force at
+s kinks the axis of an arm that shears, away from the r(s) whose gap is closed.
 """
 
 from typing import NamedTuple
@@ -33,7 +39,7 @@ from jaxtyping import Array
 
 from ..arm.obstacles import Obstacle
 from ..arm.rod import Rod
-from ..numerics.quadrature import Grid, gauss_legendre, interpolation
+from ..numerics.quadrature import Grid, gauss_legendre, integral_weights, value_weights
 from ..numerics.stacked import cross, matmul, once, rows, skew, total
 from .nearest import nearest_points
 from .pose_terms import starts_of
@@ -94,6 +100,18 @@ class Touch(NamedTuple):
         """Force on the arm (3)."""
         normal = self.force * self.normal
         return normal if self.slip is None else normal + self.slip.force
+
+    def carried(self, step: Array, sigma: Array, smooth: bool) -> Array:
+        """Wrench (6, ...) of the contacts of a step on what lies before a place in it, less that on
+        its first node, without the moments of forces: all of it before their own place, or spread
+        over the step by the polynomial through their shares."""
+        shares = self.shares[:, :, step]
+        if smooth:
+            before = total(value_weights(sigma, shares.shape[0])[:, None] * shares, 0)
+        else:
+            before = sigma < self.sigma[:, step]
+        moment = jnp.zeros_like(self.push) if self.moment is None else self.moment
+        return total((before - shares[0]) * jnp.concatenate([moment, self.push])[:, :, step], 1)
 
     @property
     def moment(self) -> Array | None:
@@ -159,14 +177,16 @@ def touch_of(axis: Array, rotation: Array, grid: Grid, around: Surroundings) -> 
         force = jnp.where(around.soft > 0, penalty, force)
         rate = jnp.where(around.soft > 0, rate, 0.0)
         bend = force * bend + rate * near.normal[:, None] * near.normal
-    cumulative, weights = _weights(near.sigma, grid.X.shape[0])
+    stages = grid.X.shape[0]
+    cumulative = integral_weights(near.sigma, stages)
     slip = None
     if around.rough is not None:
-        values = _values(near.sigma, grid.X.shape[0])
+        values = value_weights(near.sigma, stages)
         at = near.place, near.normal, force, near.outline
         slip = slip_of(around.rough, *at, cumulative, values, rotation, grid)
-    shares = cumulative / weights.reshape(-1, *(1,) * near.sigma.ndim)
-    cell = _cell_of(near.sigma, grid.X.shape[0])
+    weights = gauss_legendre(stages)[1].reshape(-1, *(1,) * near.sigma.ndim)
+    shares = cumulative / jnp.asarray(weights, cumulative.dtype)
+    cell = _cell_of(near.sigma, stages)
     along = jnp.pad(grid.weight * axis, [(0, 0), (1, 0), *[(0, 0)] * (axis.ndim - 2)])
     ends = starts[:, None] + jnp.cumsum(along, axis=1)
     lever = near.place - total(cell * ends[:, :, None], 1)
@@ -275,23 +295,3 @@ def received(handed: Array, x: Array) -> Array:
     """What each step receives of numbers (obstacles, steps, *arms) that are handed on."""
     forth, back = jnp.maximum(handed, 0.0) * x, jnp.maximum(-handed, 0.0) * x
     return _beside(forth, 1) + _beside(back, -1)
-
-
-def _weights(sigma: Array, stages: int) -> tuple[Array, Array]:
-    """Weights (stages, ...) of the integral from the start of a step of length 1 to sigma, and of
-    that over the whole step."""
-    cumulative = _by_nodes([sigma ** (p + 1) / (p + 1) for p in range(stages)])
-    return cumulative, jnp.asarray(gauss_legendre(stages)[1], sigma.dtype)
-
-
-def _values(sigma: Array, stages: int) -> Array:
-    """Weights (stages, ...) of the nodes in the polynomial at sigma."""
-    return _by_nodes([sigma**p for p in range(stages)])
-
-
-def _by_nodes(powers: list[Array]) -> Array:
-    """Weights (stages, ...) of the nodes in the polynomial through them, from its powers or
-    anything linear in them."""
-    stages = len(powers)
-    b = jnp.asarray(interpolation(stages), powers[0].dtype)
-    return jnp.stack([sum(b[p, j] * powers[p] for p in range(stages)) for j in range(stages)])

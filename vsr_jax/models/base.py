@@ -248,6 +248,13 @@ class SteppedModel(Model):
         )  # friction reduces a thread's force, loads do not
         return step_error(nodes.xi, sections, forces, nodes.grid, loaded=scene.loaded)
 
+    def smooth_strain(
+        self, scene: Scene, forces: Forces, state: Any, X: Float[Array, " stations"]
+    ) -> Vector:
+        """The strain from which positions between the nodes follow: as `strain`, but without jumps
+        at contacts."""
+        return self.strain(scene, forces, state, X)
+
     @abstractmethod
     def node_strain(self, scene: Scene, state: Any) -> Vector:
         """Strain at the nodes of `grid`, six component arrays of shape (stages, steps)."""
@@ -304,7 +311,7 @@ class SteppedModel(Model):
         h = X - grid.start[step]
         nodes = gauss_legendre(self.order // 2)[0].astype(h.dtype)
         X_nodes = grid.start[step] + nodes[:, None] * h
-        strain = self.strain(scene, forces, state, X_nodes.reshape(-1))
+        strain = self.smooth_strain(scene, forces, state, X_nodes.reshape(-1))
         stages = tuple(
             tuple(x.reshape(X_nodes.shape)[i] for x in strain) for i in range(len(nodes))
         )

@@ -194,9 +194,21 @@ class StrainDependent(SteppedModel):
     def strain(
         self, scene: Scene, forces: Forces, state: ArmSolution, X: Float[Array, " stations"]
     ) -> Vector:
+        return self._strain(scene, forces, state, X)
+
+    def smooth_strain(
+        self, scene: Scene, forces: Forces, state: ArmSolution, X: Float[Array, " stations"]
+    ) -> Vector:
+        return self._strain(scene, forces, state, X, smooth=True)
+
+    def _strain(
+        self, scene: Scene, forces: Forces, state: ArmSolution, X: Array, *, smooth: bool = False
+    ) -> Vector:
         grid = self.grid(scene)
         loads = self.loading(scene, state, grid)
-        reaction = None if loads is None else react_at(state.xi, grid, loads, X, forces)
+        reaction = (
+            None if loads is None else react_at(state.xi, grid, loads, X, forces, smooth=smooth)
+        )
         tau = shared(forces, state.shares_at(scene, grid, X, forces))
         if loads is not None and loads.discs is not None:
             tau = loads.discs.elsewhere(tau)

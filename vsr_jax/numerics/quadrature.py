@@ -191,7 +191,24 @@ def onto(X: Array, start: Array | float, end: Array | float, slack: Array) -> tu
 def within(density: Array, grid: Grid, step: Array, sigma: Array | float) -> Array:
     r"""Integral from the start of a step to the fraction $\sigma$ of it of the polynomial through
     the values at its nodes, shape (components, stages, steps)."""
-    stages = grid.X.shape[0]
-    weights, q = interpolation(stages), density[:, :, step]
-    parts = [sigma ** (p + 1) / (p + 1) * weighted(weights[p], q, axis=1) for p in range(stages)]
+    weights = integral_weights(jnp.asarray(sigma, density.dtype), grid.X.shape[0])
+    parts = [weight * density[:, i, step] for i, weight in enumerate(weights)]
     return grid.h[step] * sum(parts[1:], parts[0])
+
+
+def value_weights(sigma: Array, stages: int) -> Array:
+    r"""Weights (stages, ...) of the values at the nodes of a step in their polynomial at the
+    fraction $\sigma$ of it."""
+    return _by_nodes([sigma**p for p in range(stages)])
+
+
+def integral_weights(sigma: Array, stages: int) -> Array:
+    r"""Weights (stages, ...) of the values at the nodes of a step of length 1 in the integral of
+    their polynomial from the start to the fraction $\sigma$."""
+    return _by_nodes([sigma ** (p + 1) / (p + 1) for p in range(stages)])
+
+
+def _by_nodes(powers: list[Array]) -> Array:
+    """Weights of the nodes in what is linear in a polynomial, from that of each power."""
+    rows = interpolation(len(powers)).T.tolist()
+    return jnp.stack([sum(b * x for b, x in zip(row, powers, strict=True)) for row in rows])
