@@ -145,6 +145,40 @@ def test_contact_pushes_only_where_the_gap_is_closed(pressed):
     assert float(gap.min()) > -1e-4 * 0.005
 
 
+def test_soft_arms_do_not_pass_what_they_touch():
+    """Pressed across a pillar at many places of a step, the arm shears and bends within the step;
+    positions between the contacts too stay outside."""
+    soft = vsr.Rod(L, vsr.Circular(0.005), vsr.Material(2e5, poisson=0.4))
+
+    @jax.jit
+    @jax.vmap
+    def lowest(X):
+        pillar = vsr.Cylinder(
+            0.02, pose=vsr.pose(jnp.stack([X, 0.0, -0.03]), pointing=(0.0, 1.0, 0.0))
+        )
+        load = vsr.TipWrench(force=(0, 0, -0.03))
+        eq = vsr.solve(
+            vsr.Scene(soft, (), load, obstacles=pillar),
+            jnp.zeros(0),
+            model=vsr.StrainDependent(24),
+        )
+        gaps = jax.vmap(pillar.distance)(eq.position(jnp.linspace(0, L, 801))) - 0.005
+        return eq.status, jnp.min(gaps), jnp.max(eq.contacts.force)
+
+    status, gap, force = lowest(jnp.linspace(0.1, 0.1 + L / 24, 6))
+    assert np.all(status == vsr.Status.CONVERGED)
+    assert float(force.min()) > 0.03
+    assert float(gap.min()) > -1e-4 * 0.005
+
+
+def test_a_tip_rests_on_what_it_presses(pressed):
+    """The contact is at the end of the last step; nothing lifts it there."""
+    below = vsr.Plane((0, 0, 1), (0, 0, -0.02))
+    eq = solved(PRESS, obstacles=below)
+    assert float(eq.contacts.force[0, -1]) > 1e-3
+    np.testing.assert_allclose(below.distance(eq.tip[:3, 3]), 0.005, atol=1e-9)
+
+
 def test_a_touching_arm_is_the_free_arm_under_its_contact_force(pressed):
     """The same arm without obstacle, loaded by the contact force: other code, with the force at a
     breakpoint."""
