@@ -133,14 +133,13 @@ def cold_start(runs: int = 3) -> dict[str, dict[str, float]]:
     run in a new process."""
     rows: dict[str, list[list[str]]] = {}
     with TemporaryDirectory() as folder:
-        for i in range(runs + 1):  # the first one fills the folder
+        for i in range(runs + 1):  # the first round fills the folder and is not counted
             for answer, name in product(COLD_JOBS, COLD_OPTIONS):
                 scene, job = COLD_JOBS[answer]
                 options = COLD_OPTIONS[name].format(folder=folder)
                 program = COLD.format(scene=COLD_SCENES[scene], options=options, job=job)
-                if i or options != COLD_OPTIONS[name]:
-                    command = [sys.executable, "-c", program]
-                    done = subprocess.run(command, capture_output=True, text=True, check=True)
+                command = [sys.executable, "-c", program]
+                done = subprocess.run(command, capture_output=True, text=True, check=True)
                 if i:
                     rows.setdefault(f"{answer}, {name}", []).append(done.stdout.split())
     found = {}
