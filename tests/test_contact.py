@@ -171,14 +171,6 @@ def test_soft_arms_do_not_pass_what_they_touch():
     assert float(gap.min()) > -1e-4 * 0.005
 
 
-def test_a_tip_rests_on_what_it_presses(pressed):
-    """The contact is at the end of the last step; nothing lifts it there."""
-    below = vsr.Plane((0, 0, 1), (0, 0, -0.02))
-    eq = solved(PRESS, obstacles=below)
-    assert float(eq.contacts.force[0, -1]) > 1e-3
-    np.testing.assert_allclose(below.distance(eq.tip[:3, 3]), 0.005, atol=1e-9)
-
-
 def test_a_touching_arm_is_the_free_arm_under_its_contact_force(pressed):
     """The same arm without obstacle, loaded by the contact force: other code, with the force at a
     breakpoint."""

@@ -115,14 +115,12 @@ class _Curves(NamedTuple):
     h: Array
 
     def begun(self) -> tuple["_Curves", Array]:
-        """The curves with less epsilon the more the gaps bulge or fall, and the best samples of
-        places."""
+        """The curves with less epsilon the more the gaps bulge, and the best samples of places."""
         samples = np.linspace(0.0, 1.0, _SAMPLES).tolist()
         gaps = jax.vmap(self.gaps)(jnp.asarray(samples, self.h.dtype))
         middle = gaps[_SAMPLES // 2]
         bulge = jnp.maximum(0.5 * (gaps[0] + gaps[-1]) - middle, 0.0) / self.epsilon
-        fall = jnp.maximum(0.5 * jnp.abs(gaps[0] - gaps[-1]) / self.epsilon - 2, 0.0)
-        curves = self._replace(epsilon=once(self.epsilon * jnp.exp(-(bulge**2) - fall**2)))
+        curves = self._replace(epsilon=once(self.epsilon * jnp.exp(-(bulge**2))))
         best, least = jnp.zeros_like(middle), jnp.full_like(middle, jnp.inf)
         for s, gap in zip(samples, gaps, strict=True):
             raised = gap + curves.excess(s)

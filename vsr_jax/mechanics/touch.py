@@ -9,12 +9,8 @@ with the distance d to the obstacle and the polynomial r(s) through the step. Th
 makes it unique where the arm lies along a surface; the least value is that which contact keeps from
 being negative, since its derivative is that of the gap at a given place. Where the gap has a clear
 minimum $\epsilon$ vanishes: with the bulge b of the gap over the step, its end values on average
-less the middle one, and the half a of their difference,
-
-$$\epsilon = \epsilon_0 \exp(-\max(b / \epsilon_0, 0)^2 - \max(|a| / \epsilon_0 - 2, 0)^2).$$
-
-The bulge makes the sum convex in s at least as much as without it; with $|a| > 2 \epsilon$ the
-least value is at an end, whatever $\epsilon$ is. $\epsilon_0$ is 1e-3 of the outline; where a first
+less the middle one, $\epsilon = \epsilon_0 \exp(-(b / \epsilon_0)^2)$ for b > 0. The sum is then
+convex in s at least as much as without bulge. $\epsilon_0$ is 1e-3 of the outline; where a first
 attempt to solve fails, it is the bulge $h^2 / (8 L)$ on a step of length h of a gap that curves by
 1 / L, with the length L of the arm. The contact force is $\lambda n$ with $n = \nabla d$, and
 friction as in `slip`.
