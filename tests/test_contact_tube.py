@@ -138,3 +138,44 @@ def test_an_arm_that_has_buckled_in_a_tube():
             margin = 1 - share * TOUCHING / leaves
             np.testing.assert_allclose(eq.stability, margin, atol=2e-4)
     assert int(aside(1.01 * leaves, WEIGHT, eq).status) == vsr.Status.UNSTABLE
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("clearance", [0.005, 0.01])
+def test_an_arm_that_has_buckled_into_a_helix(clearance):
+    r"""Weightless arm with one end free, pressed far beyond snaking. Nothing turns it about the
+    tube, so that away from the ends it is the helix of the angle $\alpha$ with $F = 2 EI \sin^2
+    \alpha \cos\alpha / r^2$, pressed to the wall by $EI \sin^4\alpha / r^3$ per length; for small
+    angles the pitch is $\pi \sqrt{8 EI / F}$ and the force $r F^2 / (4 EI)$ (Lubinski, Althouse
+    and Logan 1962; Mitchell 1982). The formulas hold for any thrust and clearance; a bend at rest
+    near the base, which is gone in the middle, selects one of all helices around the tube."""
+    thrust, steps = 300.0, 48
+    angle = brentq(
+        lambda x: 2 * np.sin(x) ** 2 * np.cos(x) - thrust * (clearance / L) ** 2, 1e-6, 0.9
+    )
+    bend, turn = np.sin(angle) ** 2 / clearance, np.sin(angle) * np.cos(angle) / clearance
+    bends = [
+        vsr.FunctionProfile(lambda X, trig=trig: 4 * bend * jnp.exp(-20 * X / L) * trig(turn * X))
+        for trig in (jnp.cos, jnp.sin)
+    ]
+    rod = vsr.Rod(
+        L,
+        vsr.Circular(RADIUS),
+        vsr.Material(YOUNG, poisson=0.4),
+        rest_strain=(0.0, *bends, 1.0, 0.0, 0.0),
+    )
+    scene = vsr.Scene(
+        rod,
+        loads=[vsr.TipWrench(force=(-thrust * FORCE, 0.0, 0.0))],
+        obstacles=vsr.Tube(clearance + RADIUS),
+        free_strains=("torsion", "bending_y", "bending_z"),
+    )
+    eq = vsr.solve(scene, jnp.zeros(0), model=vsr.StrainDependent(steps))
+    assert bool(eq.converged)
+    X = np.linspace(20, 26, 41) * L / steps
+    _, y, z = eq.position(X).T
+    np.testing.assert_allclose(np.hypot(y, z), clearance, rtol=1e-4)
+    around = np.abs(np.polyfit(X, np.unwrap(np.arctan2(z, y)), 1)[0])
+    np.testing.assert_allclose(around, np.sin(angle) / clearance, rtol=5e-4)
+    force = np.ravel(eq.contacts.force)[20:26] * steps / L
+    np.testing.assert_allclose(force, EI * np.sin(angle) ** 4 / clearance**3, rtol=2e-3)

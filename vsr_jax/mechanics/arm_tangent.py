@@ -21,6 +21,7 @@ from .elimination_nodes import Definiteness
 from .pose_elimination import eliminate_poses, motions
 from .reaction import slopes_of
 from .sizes import node_weight
+from .sliding import sliding_of
 from .springs import with_springs
 
 _REFINEMENTS = 60
@@ -65,6 +66,9 @@ def approximate_solve(
     )
 
     along, loads = at.along, at.loads
+    sliding = None if along is None else sliding_of(along, sections.stiffness, flexible, free, grid)
+    if along is not None and sliding is not None:
+        along = along._replace(touch=sliding.touch)
     if along is None or loads is None:
         slopes = pull = None
     else:
@@ -78,7 +82,8 @@ def approximate_solve(
     pushes = [one.pushes(right.coupled[place]) for place, one in points.items()]
     if slopes is not None and slopes.contacts is not None:
         (springs,) = points.values()
-        slopes = slopes._replace(cells=springs.slopes(slopes.contacts))
+        cells, part = springs.slopes(slopes.contacts)
+        slopes = slopes._replace(cells=cells, part=part)
 
     def solve(b: Vector, *push: Array) -> tuple[Vector, Definiteness]:
         if along is not None and slopes is not None and slopes.motion == 6:
@@ -88,7 +93,11 @@ def approximate_solve(
     if along is not None and loads is not None and pull is not None:
         springs = pull.springs(along.rotation, cut=loads.only_discs)
         solve = with_springs(solve, springs, grid)
-    strain, (negative, doubtful) = solve(spread(right.wrench, free), *pushes)
+    b = spread(right.wrench, free)
+    if sliding is not None:
+        b, more = sliding.driven(b)
+        pushes = [push + more for push in pushes]
+    strain, (negative, doubtful) = solve(b, *pushes)
     coupled, (borders, border) = list(right.coupled), borders_of(problem, unknown.coupled, at)
     if border is not None:
         parts = [right.coupled[place] for place in borders]
@@ -99,7 +108,12 @@ def approximate_solve(
             coupled[place], first = x[first : first + len(part)], first + len(part)
     for place, one in points.items():
         assert along is not None
-        coupled[place] = one.change(coupled[place], motions(strain, along, grid))
+        assert slopes is not None
+        assert slopes.part is not None
+        moved = motions(strain, slopes.part, along, grid)
+        coupled[place] = one.change(coupled[place], moved)
+        if sliding is not None:
+            strain = sliding.followed(strain, moved)
     return ArmUnknown(strain, tuple(coupled)), negative == 0, doubtful
 
 

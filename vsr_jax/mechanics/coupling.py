@@ -34,7 +34,7 @@ from ..numerics.stacked import once, total
 from .balance import without_force
 from .reaction import Loading, Reaction
 from .slip import Slip
-from .touch import at_cells, from_cells, received, to_cells
+from .touch import received
 
 SOFTENED = (SOFT_STAGES - 0.5) / HARDENING_STAGES
 """Hardness from which constraints have no energy."""
@@ -166,10 +166,10 @@ class PointForces(NamedTuple):
     the wrench w of a unit force, a without friction. Springs of the stiffness $f w a^T / c$ stand
     for them in the elimination, in place of a border.
 
-    - `wrench`, `direction`: w and a, in the world frame at an end of the cell of a node, shape (6,
-      n, steps, ...).
-    - `cell`: 1 for that end, else 0, shape (stages + 1, n, steps, ...); the first end of each step
-      is its start.
+    - `wrench`, `direction`: w and a, in the world frame about the node in whose cell they act,
+      shape (6, n, steps, ...).
+    - `cell`: 1 for that node, else 0, shape (stages, n, steps, ...); `part` of the cell before
+      them, shape (n, steps, ...).
     - `factors`, `corner`: f and c, shape (n, steps, ...).
     - `handed`: 1 or -1 where the unknown of a step is part of the force of the next or the last
       one, else 0, shape (n, steps, ...); f is zero and c is 1 for it.
@@ -181,20 +181,25 @@ class PointForces(NamedTuple):
     wrench: Array
     direction: Array
     cell: Array
+    part: Array
     factors: Array
     corner: Array
     handed: Array
     slip: Slip | None = None
 
-    def slopes(self, contacts: Array) -> Array:
-        """Derivatives (6, 6, stages, steps, ...) of the wrenches by the motions of the ends of the
-        cells, with those of given `contacts` (6, 6, obstacles, steps, ...)."""
+    def slopes(self, contacts: Array) -> tuple[Array, Array]:
+        """Derivatives (6, 6, stages, steps, ...) of the wrenches by the motions in the cells, with
+        those of given `contacts` (6, 6, obstacles, steps, ...), and the part of each cell (stages,
+        steps, ...) before them: of several the mean, the stiffest first."""
         stiffness = once(self.factors) / self.corner
         square = (stiffness * self.wrench)[:, None] * self.direction
         for place in range(0, square.shape[2], contacts.shape[2]):
             here = lax.slice_in_dim(square, place, place + contacts.shape[2], axis=2)
             contacts = contacts - here
-        return at_cells(self.cell[:, : contacts.shape[2]], once(contacts))
+        cell = self.cell[:, : contacts.shape[2]]
+        stiffness, least = self.cell * stiffness, float(jnp.finfo(stiffness.dtype).tiny)
+        part = total(stiffness * self.part, 1) / (total(stiffness, 1) + least)
+        return total(cell * once(contacts)[:, :, None], 3), part
 
     def pushes(self, rows: PyTree) -> Array:
         """Changes (6, stages, steps, ...) of the wrenches by given rows (n * steps, ...) alone."""
@@ -202,11 +207,12 @@ class PointForces(NamedTuple):
         if self.slip is not None:  # friction on the arm is what its unknown is without the row
             first, *tangents = jnp.split(self._listed(rows), 3)
             force = force - jnp.concatenate([jnp.zeros_like(first), *tangents])
-        return to_cells(total(self.cell * once(force * self.wrench)[:, None], 2), 1)
+        return total(self.cell * once(force * self.wrench)[:, None], 2)
 
     def change(self, rows: PyTree, motions: Array) -> PyTree:
-        """Changes of the unknowns for given rows and motions (6, stages, steps, ...)."""
-        there = total(self.cell * from_cells(motions, 1)[:, :, None], 1)
+        """Changes of the unknowns for given rows and motions in the cells (6, stages, steps,
+        ...)."""
+        there = total(self.cell * motions[:, :, None], 1)
         moved = self.factors * total(self.direction * there, 0)
         change = (self._listed(rows) - moved) / self.corner
         change = change - received(self.handed, change)

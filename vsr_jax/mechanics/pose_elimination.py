@@ -23,6 +23,13 @@ act at the end of the first cell: one with the wrench (c, f) and the derivative 
 there adds
 
 $$K + \tfrac12 \begin{pmatrix} \tilde c & -\tilde f \\ \tilde f & 0 \end{pmatrix}.$$
+
+A contact acts inside a cell. Behind the part $\alpha$ of it the arm has moved by $z + \alpha w
+\delta\xi$, about the node; with the derivative K and a given change p of the wrench there, the
+hinge has $H + H_w - w (\hat Q + \alpha^2 K)$ and $(\hat Q - \tfrac12 A + \alpha K) z + q + \alpha p
++ b$, and before it is $(\hat Q + K) z + q + p + w (\hat Q + \tfrac12 A + \alpha K) \, \delta\xi$.
+Contacts on neighbouring steps are so near to each other that the compliance of their own cells
+decides on their forces.
 """
 
 from functools import partial
@@ -71,6 +78,8 @@ class Hinge(NamedTuple):
     - `load`: derivative by the motion at the end of the cell of the loads there, and their right
       side, shape (6, 7).
     - `flexible`: 1, or 0 where the section is rigid; None without rigid pieces.
+    - `inside`: as `load`, of what acts in the cell, about the node, and the part of the cell before
+      it; None if nothing does.
     """
 
     width: Array
@@ -81,6 +90,7 @@ class Hinge(NamedTuple):
     given: Array
     load: Array
     flexible: Array | None
+    inside: tuple[Array, Array] | None
 
 
 def eliminate_poses(
@@ -95,8 +105,8 @@ def eliminate_poses(
 ) -> tuple[Vector, Definiteness]:
     """As `eliminate`, for motions of size 6.
 
-    **Arguments:** `push`: changes (6, stages, steps, *arms) of the wrenches at the ends of the
-    cells in the world frame that do not depend on the motions, a right side too.
+    **Arguments:** `push`: changes (6, stages, steps, *arms) of the wrenches in the cells in the
+    world frame, about the nodes, that do not depend on the motions, a right side too.
     """
     H = c.symmetric(lower)
     arms = jnp.broadcast_shapes(*(x.shape[2:] for x in (*H[0], *right, grid.weight, along.axis[0])))
@@ -129,9 +139,9 @@ def eliminate_poses(
     return found, definiteness(negative, local, asymmetry, grid)
 
 
-def motions(strain: Vector, along: Reaction, grid: Grid) -> Array:
-    """Rotations and displacements (6, stages, steps, *arms) in the world frame of the ends of the
-    cells by a change of strain, as the elimination has them."""
+def motions(strain: Vector, part: Array, along: Reaction, grid: Grid) -> Array:
+    """Rotations and displacements (6, stages, steps, *arms) in the world frame behind a part of
+    each cell, about the nodes, by a change of strain, as the elimination has them."""
     change = grid.weight * turned(along.rotation, stack(strain))
 
     def summed(x: Array) -> Array:
@@ -140,11 +150,12 @@ def motions(strain: Vector, along: Reaction, grid: Grid) -> Array:
         flat = listed.reshape(3, -1, *listed.shape[3:])
         return jnp.cumsum(flat, axis=1).reshape(listed.shape).swapaxes(1, 2)
 
-    bent = rows(change, 0, 3)
-    ends = summed(bent)
-    middle = ends - 0.5 * bent
-    moved = cross(middle, grid.weight * along.axis) + rows(change, 3, 6)
-    return jnp.concatenate([ends, summed(moved)])
+    bent, slid = rows(change, 0, 3), rows(change, 3, 6)
+    ends, reach = summed(bent), 0.5 * grid.weight * along.axis
+    moved = cross(2.0 * ends - bent, reach) + slid
+    there = summed(moved) - cross(ends, reach)  # behind the hinge at the node
+    ahead = 1.0 - part
+    return jnp.concatenate([ends - ahead * bent, there - ahead * slid])
 
 
 def _hinges(
@@ -185,9 +196,6 @@ def _hinges(
     jump = jumps(slopes, grid)
     if jump is not None:
         jump = listed(at_last_nodes(jump, grid.X.shape[0]))
-    if slopes.cells is not None:
-        cells = listed(slopes.cells)
-        jump = cells if jump is None else jump + cells
     if slopes.density is not None:
         density = 0.5 * w * listed(slopes.density)
         density = _carried(density, -reach) + _carried(after(density), after(reach))
@@ -201,11 +209,16 @@ def _hinges(
     load = _half(load)
     load = _blocks(-load[:3, :3], load[:3, 3:], -load[3:, :3], load[3:, 3:])
     load = load if jump is None else load + jump
-    load = _beside(load, jnp.zeros_like(wrench) if push is None else listed(push))
+    none = jnp.zeros_like(wrench)
+    load = _beside(load, none)
+    inside = None
+    if slopes.cells is not None and slopes.part is not None:
+        cells = _beside(listed(slopes.cells), none if push is None else listed(push))
+        inside = cells, listed(slopes.part)
     given, lever = _beside(-_half(wrench), b), skew(reach)
     lever = jnp.pad(lever, [(0, 0), (0, 4), *[(0, 0)] * (lever.ndim - 2)])
     flexible = None if flexible is None else listed(flexible)
-    return Hinge(w, reach, R, lever, stiff, given, load, flexible)
+    return Hinge(w, reach, R, lever, stiff, given, load, flexible, inside)
 
 
 def _before(free: tuple[int, ...], end: tuple[Array, Array], hinge: Hinge) -> tuple[tuple, tuple]:
@@ -218,10 +231,18 @@ def _before(free: tuple[int, ...], end: tuple[Array, Array], hinge: Hinge) -> tu
     size, w = len(hinge.stiff), hinge.width
     load, given = (_halves(x) for x in (hinge.load, hinge.given))
     beyond = _before_link((end[0] + load[0], end[1] + load[1]), hinge.lever)
-    right = tuple(once(x + y) for x, y in zip(beyond, given, strict=True))[: size // 3]
+    # what a strain and a motion before the hinge do, and a strain to itself
+    bent = twice = before = beyond
+    if hinge.inside is not None:
+        inside, part = _halves(hinge.inside[0]), hinge.inside[1]
+        moved = [once(part * x) for x in inside]
+        bent = tuple(once(x + y) for x, y in zip(beyond, moved, strict=True))
+        twice = tuple(once(x + part * y) for x, y in zip(beyond, moved, strict=True))
+        before = tuple(once(x + y) for x, y in zip(beyond, inside, strict=True))
+    right = tuple(once(x + y) for x, y in zip(bent, given, strict=True))[: size // 3]
     D = [
         [
-            hinge.stiff[3 * i : 3 * i + 3, 3 * j : 3 * j + 3] - w * beyond[i][:, 3 * j : 3 * j + 3]
+            hinge.stiff[3 * i : 3 * i + 3, 3 * j : 3 * j + 3] - w * twice[i][:, 3 * j : 3 * j + 3]
             for j in range(size // 3)
         ]
         for i in range(size // 3)
@@ -233,10 +254,10 @@ def _before(free: tuple[int, ...], end: tuple[Array, Array], hinge: Hinge) -> tu
         compliance = jnp.where(bends, compliance, 0.0)
         negative = jnp.where(bends, negative, 0)
     start = []
-    for Q, half in zip(beyond, given, strict=True):
+    for Q, held, half in zip(bent, before, given, strict=True):
         turning = once(w * (Q - half))
         parts = [_product(columns(turning, 3 * i, 3 * i + 3), x) for i, x in enumerate(X)]
-        start.append(once(sum(parts, Q)))
+        start.append(once(sum(parts, held)))
     start = _before_link((start[0], start[1]), hinge.lever)
     Q = columns(beyond[0], 0, 3)
     return start, (jnp.concatenate(X), negative, asymmetry_of(Q, None, compliance))

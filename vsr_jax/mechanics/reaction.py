@@ -170,8 +170,8 @@ class Slopes(NamedTuple):
     """Derivatives of the loads in the world frame with respect to motions of their sections: of the
     density (6, motion, stages, steps), None if it is constant, of the wrenches at points, of those
     of chords at the ends of the steps (6, motion, steps), of those of `contacts`, each by the
-    motion of the end of a cell (6, 6, obstacles, steps), and of what acts at the ends of the
-    `cells` of the nodes (6, 6, stages, steps).
+    motion there (6, 6, obstacles, steps), and of what acts in the `cells` of the nodes, about
+    these (6, 6, stages, steps), behind a `part` of each (stages, steps).
 
     `joined`: 0 for each step at whose end the arm can be cut, since the wrenches on each side
     depend on the motions of that side relative to the cut; None without cuts."""
@@ -181,6 +181,7 @@ class Slopes(NamedTuple):
     ends: Array | None
     contacts: Array | None = None
     cells: Array | None = None
+    part: Array | None = None
     joined: Array | None = None
 
     @property

@@ -70,10 +70,10 @@ class Touch(NamedTuple):
     contact in the world; `sigma`, its place in the step; `shares` (stages) of a force there for the
     nodes of the step; `force` [N]; `slip`: friction, None without; `bend` (3, 3): derivative of the
     force by the displacement there, and `slide` times the product of `moved` (6) with itself that
-    by the motion of the section, as the contact slides, at a given force; `cell` (stages + 1): 1
-    for that end of the cells of the nodes which is nearest, the first of them the start of the
-    step; and `lever` (3) from there; `handed`: 1 or -1 where the force of a step is handed on to
-    the next or the last one, since the nearest point is not in it, else 0.
+    by the motion of the section, as the contact slides, at a given force; `cell` (stages): 1 for
+    the node in whose cell the contact lies, `part` of the cell before it, and `lever` (3) from the
+    node; `handed`: 1 or -1 where the force of a step is handed on to the next or the last one,
+    since the nearest point is not in it, else 0.
     """
 
     gap: Array
@@ -88,6 +88,7 @@ class Touch(NamedTuple):
     moved: Array
     slide: Array
     cell: Array
+    part: Array
     lever: Array
     handed: Array
 
@@ -116,20 +117,26 @@ class Touch(NamedTuple):
 
     @property
     def direction(self) -> Array:
-        """Wrench (6) of a unit contact force without friction about the end of the cell."""
+        """Wrench (6) of a unit contact force without friction about the node."""
         return jnp.concatenate([cross(self.lever, self.normal), self.normal])
 
     @property
     def per_force(self) -> Array:
-        """Derivative (6) of the wrench about the end of the cell by the contact force."""
+        """Derivative (6) of the wrench about the node by the contact force."""
         if self.slip is None:
             return self.direction
         return self.direction + self.slip.per_force * self._at_outline(self.slip.first)
 
     @property
+    def sliding(self) -> Array:
+        """What gives the change of the slope of the gap by the motion (6) there, about the node."""
+        turning, force = rows(self.moved, 0, 3), rows(self.moved, 3, 6)
+        return jnp.concatenate([turning + cross(self.lever, force), force])
+
+    @property
     def tangents(self) -> Array:
-        """Wrenches (6) of unit friction forces in both directions about the end of the cell, those
-        in the second one after all in the first."""
+        """Wrenches (6) of unit friction forces in both directions about the node, those in the
+        second one after all in the first."""
         assert self.slip is not None
         both = self.slip.first, self.slip.second
         return jnp.concatenate([self._at_outline(x) for x in both], axis=1)
@@ -146,7 +153,7 @@ class Touch(NamedTuple):
         return jnp.concatenate(both, axis=1)
 
     def _at_outline(self, force: Array) -> Array:
-        """Wrench of a force at the outline about the end of the cell."""
+        """Wrench of a force at the outline about the node."""
         assert self.slip is not None
         return jnp.concatenate([cross(self.lever + self.slip.lever, force), force])
 
@@ -182,10 +189,10 @@ def touch_of(axis: Array, rotation: Array, grid: Grid, around: Surroundings) -> 
         slip = slip_of(around.rough, *at, cumulative, values, rotation, grid)
     weights = gauss_legendre(stages)[1].reshape(-1, *(1,) * near.sigma.ndim)
     shares = cumulative / jnp.asarray(weights, cumulative.dtype)
-    cell = _cell_of(near.sigma, stages)
-    along = jnp.pad(grid.weight * axis, [(0, 0), (1, 0), *[(0, 0)] * (axis.ndim - 2)])
-    ends = starts[:, None] + jnp.cumsum(along, axis=1)
-    lever = near.place - total(cell * ends[:, :, None], 1)
+    cell, part = _cell_of(near.sigma, stages)
+    along = grid.weight * axis
+    nodes = starts[:, None] + jnp.cumsum(along, axis=1) - 0.5 * along
+    lever = near.place - total(cell * nodes[:, :, None], 1)
     found = Touch(
         gap,
         raised,
@@ -199,6 +206,7 @@ def touch_of(axis: Array, rotation: Array, grid: Grid, around: Surroundings) -> 
         near.moved,
         force * near.slide,
         cell,
+        part,
         lever,
         handed,
     )
@@ -220,10 +228,9 @@ def contact_wrenches(touch: Touch) -> Array:
 
 def touch_slopes(touch: Touch) -> Array:
     """Derivatives (6, 6, obstacles, steps, *arms) of the contact wrenches by the motions of the
-    ends of their cells."""
+    arm there, about the nodes of their cells."""
     d = skew(touch.lever)
-    turning, force = rows(touch.moved, 0, 3), rows(touch.moved, 3, 6)
-    moved = once(jnp.concatenate([turning + cross(touch.lever, force), force]))
+    moved = once(touch.sliding)
     above, below = matmul(d, touch.bend), matmul(touch.bend, d)
     corner = matmul(skew(touch.push) - above, d)
     top = jnp.concatenate([corner, above], axis=1)
@@ -231,39 +238,21 @@ def touch_slopes(touch: Touch) -> Array:
     return bent + (touch.slide * moved)[:, None] * moved
 
 
-def at_cells(cell: Array, slopes: Array) -> Array:
-    """Derivatives (6, 6, stages, steps, *arms) of wrenches by the motions of the ends of the cells,
-    from those of each contact (6, 6, obstacles, steps, *arms) and its `Touch.cell`."""
-    return to_cells(total(cell * slopes[:, :, None], 3), 2)
-
-
-def to_cells(x: Array, axis: int) -> Array:
-    """What acts at the ends of the cells (..., stages + 1, steps, *arms), the first of them the
-    start of the step, as (..., stages, steps, *arms). Nothing moves the start of the arm."""
-    x = once(x)  # XLA would compute a sum again for each of its parts, without vectors
-    ahead = lax.slice_in_dim(x, 0, 1, axis=axis)
-    ahead = lax.slice_in_dim(ahead, 1, None, axis=axis + 1)
-    stages = x.shape[axis] - 1
-    room = [(0, 0)] * x.ndim
-    room[axis], room[axis + 1] = (stages - 1, 0), (0, 1)
-    return once(lax.slice_in_dim(x, 1, None, axis=axis) + jnp.pad(ahead, room))
-
-
-def from_cells(x: Array, axis: int) -> Array:
-    """The transposed map: what moves (..., stages, steps, *arms) at all ends of the cells."""
-    before = lax.slice_in_dim(x, x.shape[axis] - 1, None, axis=axis)
-    before = lax.slice_in_dim(before, 0, x.shape[axis + 1] - 1, axis=axis + 1)
-    room = [(0, 0)] * x.ndim
-    room[axis + 1] = (1, 0)
-    return once(jnp.concatenate([jnp.pad(before, room), x], axis=axis))
-
-
-def _cell_of(sigma: Array, stages: int) -> Array:
-    """1 for the end of a cell that is nearest to a place in the step, else 0."""
-    ends = np.cumsum([0.0, *gauss_legendre(stages)[1]])
-    between = np.concatenate([[-np.inf], (ends[1:] + ends[:-1]) / 2, [np.inf]])
-    limits = jnp.asarray(between, sigma.dtype).reshape(-1, *(1,) * sigma.ndim)
-    return ((sigma >= limits[:-1]) & (sigma < limits[1:])).astype(sigma.dtype)
+def _cell_of(sigma: Array, stages: int) -> tuple[Array, Array]:
+    """1 for the node in whose cell a place in the step lies, else 0, and the part of the cell
+    before it."""
+    weights = gauss_legendre(stages)[1]
+    ends = np.cumsum(weights)
+    first, last = (
+        jnp.asarray(x, sigma.dtype).reshape(-1, *(1,) * sigma.ndim)
+        for x in (np.append(-np.inf, ends[:-1]), np.append(ends[:-1], np.inf))
+    )
+    cell = ((sigma >= first) & (sigma < last)).astype(sigma.dtype)
+    starts, widths = (
+        total(cell * jnp.asarray(x, sigma.dtype).reshape(first.shape), 0)
+        for x in (ends - weights, weights)
+    )
+    return cell, (sigma - starts) / widths
 
 
 def _handed(nearer: Array, there: Array) -> Array:
