@@ -222,7 +222,7 @@ class Contacts(Coupling):
         self, x: PyTree, at: ArmState, note: Touch, problem: ArmProblem, free: tuple[int, ...]
     ) -> PyTree:
         force, own = note.force, self._forces(x).reshape(note.force.shape)
-        pushed = self.scale * note.raised + self.give * force
+        pushed = self.scale * note.gap + self.give * force
         rows, _ = self._smooth_minimum(force, pushed)
         rows = jnp.where(note.handed != 0, own, rows)
         if self.soft is not None:
@@ -233,7 +233,7 @@ class Contacts(Coupling):
         return rows, x[1] if note.slip is None else note.slip.row.reshape(x[1].shape)
 
     def points(self, x: PyTree, at: ArmState, note: Touch, problem: ArmProblem) -> PointForces:
-        pushed = self.scale * note.raised + self.give * note.force
+        pushed = self.scale * note.gap + self.give * note.force
         _, by_gap = self._smooth_minimum(note.force, pushed)
         free = 1 - jnp.abs(note.handed)
         free = free if self.soft is None else (1 - self.soft) * free

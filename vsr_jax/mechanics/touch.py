@@ -6,14 +6,17 @@ of the grid and for each obstacle the nearest point of the axis is found,
 $$\sigma = \arg\min_s \, d(r(s)) - \rho(s) + \epsilon (2 s - 1)^2, \quad 0 \le s \le 1,$$
 
 with the distance d to the obstacle and the polynomial r(s) through the step. The small $\epsilon$
-makes it unique where the arm lies along a surface; the least value is that which contact keeps from
-being negative, since its derivative is that of the gap at a given place. Where the gap has a clear
-minimum $\epsilon$ vanishes: with the bulge b of the gap over the step, its end values on average
-less the middle one, $\epsilon = \epsilon_0 \exp(-(b / \epsilon_0)^2)$ for b > 0. The sum is then
-convex in s at least as much as without bulge. $\epsilon_0$ is 1e-3 of the outline; where a first
-attempt to solve fails, it is the bulge $h^2 / (8 L)$ on a step of length h of a gap that curves by
-1 / L, with the length L of the arm. The contact force is $\lambda n$ with $n = \nabla d$, and
-friction as in `slip`.
+makes it unique where the arm lies along a surface. Contact keeps the gap $d - \rho$ there from being
+negative, without the term: a step along which the gap changes evenly then passes the surface with
+its end, by $\epsilon / 2$ at most. The springs of the soft stages resist the least value, since its
+derivative is that of the gap at a given place, so that they have an energy.
+
+Where the gap has a clear minimum $\epsilon$ vanishes: with the bulge b of the gap over the step,
+its end values on average less the middle one, $\epsilon = \epsilon_0 \exp(-(b / \epsilon_0)^2)$ for
+b > 0. The sum is then convex in s at least as much as without bulge. $\epsilon_0$ is 1e-3 of the
+outline; where a first attempt to solve fails, it is the bulge $h^2 / (8 L)$ on a step of length h
+of a gap that curves by 1 / L, with the length L of the arm. The contact force is $\lambda n$ with
+$n = \nabla d$, and friction as in `slip`.
 
 As an arm slides, its contact passes from step to step. Where the nearest point of a step is its
 end, and the step beyond has a nearest point of its own, that step receives the force.
@@ -66,18 +69,17 @@ class Surroundings(NamedTuple):
 class Touch(NamedTuple):
     r"""Contact of each obstacle with each step, arrays (..., obstacles, steps, *arms).
 
-    **Fields:** `gap` [m], and `raised` by the term in epsilon; `normal` (3) and `place` (3) of the
-    contact in the world; `sigma`, its place in the step; `shares` (stages) of a force there for the
-    nodes of the step; `force` [N]; `slip`: friction, None without; `bend` (3, 3): derivative of the
-    force by the displacement there, and `slide` times the product of `moved` (6) with itself that
-    by the motion of the section, as the contact slides, at a given force; `cell` (stages): 1 for
-    the node in whose cell the contact lies, `part` of the cell before it, and `lever` (3) from the
-    node; `handed`: 1 or -1 where the force of a step is handed on to the next or the last one,
-    since the nearest point is not in it, else 0.
+    **Fields:** `gap` [m]; `normal` (3) and `place` (3) of the contact in the world; `sigma`, its
+    place in the step; `shares` (stages) of a force there for the nodes of the step; `force` [N];
+    `slip`: friction, None without; `bend` (3, 3): derivative of the force by the displacement
+    there, and `slide` times the product of `moved` (6) with itself that by the motion of the
+    section, as the contact slides, at a given force; `cell` (stages): 1 for the node in whose cell
+    the contact lies, `part` of the cell before it, and `lever` (3) from the node; `handed`: 1 or -1
+    where the force of a step is handed on to the next or the last one, since the nearest point is
+    not in it, else 0.
     """
 
     gap: Array
-    raised: Array
     normal: Array
     place: Array
     sigma: Array
@@ -195,7 +197,6 @@ def touch_of(axis: Array, rotation: Array, grid: Grid, around: Surroundings) -> 
     lever = near.place - total(cell * nodes[:, :, None], 1)
     found = Touch(
         gap,
-        raised,
         near.normal,
         near.place,
         near.sigma,
