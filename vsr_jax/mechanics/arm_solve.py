@@ -19,14 +19,8 @@ from ..numerics.batching import (
     side_by_side,
 )
 from ..numerics.component import Vector
-from ..numerics.damped_newton import (
-    HARDENING_STAGES,
-    LOAD_INCREMENTS,
-    MAX_TURN,
-    Damped,
-    Measures,
-    damped_newton,
-)
+from ..numerics.damped_newton import LOAD_INCREMENTS, MAX_TURN, damped_newton
+from ..numerics.damped_rules import HARDENING_STAGES, Damped, Measures
 from ..numerics.implicit import implicit_root
 from ..numerics.newton import Root
 from ..typing import cast

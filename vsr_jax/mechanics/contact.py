@@ -41,7 +41,7 @@ from ..arm.obstacles import Obstacle
 from ..arm.rod import Rod
 from ..arm.scene import CrossSections, Scene
 from ..numerics.component import Forces, Vector
-from ..numerics.damped_newton import HARDENING_STAGES, SOFT_STAGES
+from ..numerics.damped_rules import HARDENING_STAGES, SOFT_STAGES
 from ..numerics.quadrature import Grid, locate
 from ..numerics.se3 import base_pose, stacked_rotation
 from ..typing import DTypeLike

@@ -28,7 +28,7 @@ from jaxtyping import Array, PyTree
 from ..arm.scene import CrossSections, Scene
 from ..numerics import component as c, lu
 from ..numerics.component import Forces, Vector
-from ..numerics.damped_newton import HARDENING_STAGES, SOFT_STAGES
+from ..numerics.damped_rules import HARDENING_STAGES, SOFT_STAGES
 from ..numerics.quadrature import Grid
 from ..numerics.stacked import once, total
 from .balance import without_force

@@ -6,17 +6,17 @@ of the grid and for each obstacle the nearest point of the axis is found,
 $$\sigma = \arg\min_s \, d(r(s)) - \rho(s) + \epsilon (2 s - 1)^2, \quad 0 \le s \le 1,$$
 
 with the distance d to the obstacle and the polynomial r(s) through the step. The small $\epsilon$
-makes it unique where the arm lies along a surface. Contact keeps the gap $d - \rho$ there from being
-negative, without the term: a step along which the gap changes evenly then passes the surface with
-its end, by $\epsilon / 2$ at most. The springs of the soft stages resist the least value, since its
+makes it unique where the arm lies along a surface. Contact keeps the gap $d - \rho$ there, without
+the term, from being negative: a step along which the gap changes evenly then passes the surface
+with its end, by $\epsilon / 2$ at most. The springs of the soft stages resist the least value: its
 derivative is that of the gap at a given place, so that they have an energy.
 
 Where the gap has a clear minimum $\epsilon$ vanishes: with the bulge b of the gap over the step,
 its end values on average less the middle one, $\epsilon = \epsilon_0 \exp(-(b / \epsilon_0)^2)$ for
 b > 0. The sum is then convex in s at least as much as without bulge. $\epsilon_0$ is 1e-3 of the
-outline; where a first attempt to solve fails, it is the bulge $h^2 / (8 L)$ on a step of length h
-of a gap that curves by 1 / L, with the length L of the arm. The contact force is $\lambda n$ with
-$n = \nabla d$, and friction as in `slip`.
+outline; where contacts jump without end or a first attempt to solve fails, it is $h^2 / (8 L)$, the
+bulge on a step of length h of a gap that curves by 1 / L, with the length L of the arm. The contact
+force is $\lambda n$ with $n = \nabla d$, and friction as in `slip`.
 
 As an arm slides, its contact passes from step to step. Where the nearest point of a step is its
 end, and the step beyond has a nearest point of its own, that step receives the force.
