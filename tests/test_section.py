@@ -1,5 +1,6 @@
 """Sections, materials and profiles against published constants and closed forms."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -158,6 +159,46 @@ def test_a_python_function_is_a_profile():
     np.testing.assert_allclose(
         geometry(vsr.Circular(lambda x: 0.01 - 0.01 * x)).area, np.pi * 0.007**2, rtol=1e-13
     )
+
+
+class Narrowing(eqx.Module):
+    """A radius that is a module."""
+
+    rate: jax.Array
+
+    def __call__(self, x):
+        return 0.01 - self.rate * x
+
+
+def test_the_arrays_of_a_module_that_is_a_profile_are_differentiated_and_batched():
+    def area(rate):
+        return geometry(vsr.Circular(Narrowing(rate))).area
+
+    rates = jnp.array([0.01, 0.02])
+    radius = 0.01 - 0.3 * rates
+    slopes = jax.jit(jax.vmap(jax.grad(area)))(rates)
+    np.testing.assert_allclose(jax.vmap(area)(rates), np.pi * radius**2, rtol=1e-13)
+    np.testing.assert_allclose(slopes, -0.6 * np.pi * radius, rtol=1e-13)
+    assert str(vsr.Circular(Narrowing(rates[0])).radius) == (
+        "FunctionProfile(function=Narrowing(X))"
+    )
+
+
+def test_a_function_that_closes_over_what_is_differentiated_is_refused():
+    def area(rate):
+        return geometry(vsr.Circular(lambda x: 0.01 - rate * x)).area
+
+    message = (
+        r"FunctionProfile\.function: got a function that takes rate from around it, which JAX "
+        r"transforms; need it as a parameter: FunctionProfile\(function, rate\) with function\(X, "
+        r"rate\)"
+    )
+    for transformed in (jax.grad(area), jax.jit(area)):
+        with pytest.raises(ValueError, match=message):
+            transformed(0.01)
+    rate = jnp.asarray(0.01)  # a constant
+    area = geometry(vsr.Circular(lambda x: 0.01 - rate * x)).area
+    np.testing.assert_allclose(area, np.pi * 0.007**2, rtol=1e-13)
 
 
 @pytest.mark.parametrize(

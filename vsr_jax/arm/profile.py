@@ -15,6 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
 from ..typing import ArrayLike, Scalar, Tree, VectorLike
@@ -33,8 +34,13 @@ class FunctionOfX(eqx.Module):
 
     **Arguments:**
     - `owner`: name of the class that takes the function, for error messages.
-    - `function`: takes the scalar X [m] and the parameters; written with `jax.numpy`.
+    - `function`: takes the scalar X [m] and the parameters; written with `jax.numpy`. An equinox
+      module with a method `__call__(X, *parameters)` is a parameter too: its arrays can be
+      differentiated.
     - `parameters`: pytrees of arrays, for example equinox modules; differentiable.
+
+    **Raises:** `ValueError` for what is no function, and for one whose closure holds a number that
+    is differentiated, batched or compiled, and needs to be a parameter.
     """
 
     function: Callable = eqx.field(static=True)
@@ -43,6 +49,15 @@ class FunctionOfX(eqx.Module):
     def __init__(self, owner: str, function: Callable, *parameters: PyTree):
         if not callable(function):
             raise ValueError(f"{owner}.function: got {function!r}, need a function of X")
+        traced = _traced_in(function)
+        if traced:
+            raise ValueError(
+                f"{owner}.function: got a function that takes {' and '.join(traced)} from around "
+                f"it, which JAX transforms; need it as a parameter: "
+                f"{owner}(function, {', '.join(traced)}) with function(X, {', '.join(traced)})"
+            )
+        if isinstance(function, eqx.Module):
+            function, parameters = _call, (function, *parameters)
         self.function = function
         self.parameters = jax.tree.map(
             lambda leaf: jnp.asarray(leaf) if eqx.is_array_like(leaf) else leaf, parameters
@@ -53,8 +68,30 @@ class FunctionOfX(eqx.Module):
         return self.function(X, *self.parameters)
 
     def __repr__(self) -> str:
-        name = getattr(self.function, "__name__", type(self.function).__name__)
-        return f"{name}({', '.join(('X', *map(describe, self.parameters)))})"
+        function, parameters = self.function, self.parameters
+        if function is _call:
+            function, *parameters = parameters
+        name = getattr(function, "__name__", type(function).__name__)
+        return f"{name}({', '.join(('X', *map(describe, parameters)))})"
+
+
+def _call(X: Scalar, function: Callable, *parameters: PyTree) -> PyTree:
+    """Value of a function that is itself a parameter."""
+    return function(X, *parameters)
+
+
+def _traced_in(function: Callable) -> list[str]:
+    """Names of what a function takes from around it and JAX transforms."""
+    code, cells = getattr(function, "__code__", None), getattr(function, "__closure__", None)
+    found = []
+    for name, cell in zip(code.co_freevars if code else (), cells or (), strict=True):
+        try:
+            leaves = jax.tree.leaves(cell.cell_contents)
+        except ValueError:  # a name that has no value yet
+            continue
+        if any(isinstance(leaf, Tracer) for leaf in leaves):
+            found.append(name)
+    return found
 
 
 class Profile(Part):

@@ -50,7 +50,7 @@ def solve_arm(problem: ArmProblem, free: tuple[int, ...], guess: ArmUnknown | No
     """Equilibrium of the arm; its point is an `ArmUnknown`. Newton's method starts from a guess, if
     one is given, else or where that fails from the balance without loads and couplings.
 
-    Where a second attempt found it, it is that of `problem.loosened`.
+    Where only a loosened problem was solved, it is that of `problem.loosened`.
 
     Derivatives are implicit, of any order, in forward and reverse mode: the exact tangent system is
     solved by iterative refinement of `approximate_solve`.
@@ -86,7 +86,7 @@ def solve_arm(problem: ArmProblem, free: tuple[int, ...], guess: ArmUnknown | No
         return zero._replace(xi=rest), problem.at_rest(), guess
 
     def settle(found: Root, problem: ArmProblem, guess: ArmUnknown | None) -> tuple:
-        return problem.loosened(found.again), guess
+        return problem.loosened(found.loose), guess
 
     root = implicit_root(find, imbalance, linear_solve, at_rest, problem, guess, settle=settle)
     return root._replace(x=whole(root.x, problem))
@@ -220,7 +220,7 @@ def _solve(
         root = iterated(_iteration(free, arms, given))
     if whole.dissipates is None:
         return root
-    whole = whole.loosened(root.again)
+    whole = whole.loosened(root.loose)
     at = state_of(root.x.xi, root.x.coupled, whole)
     imbalance = imbalance_of(root.x, at, whole, free)
     _, definite, _ = approximate_solve(root.x, at, imbalance, whole, free, symmetric=True)
@@ -241,8 +241,8 @@ def _iteration(
     )
     sizes = _Sizes(whole, free, arms)
 
-    def evaluate(unknown: ArmUnknown, damping: Array, share: Array, again: Array) -> Damped:
-        problem = whole.loosened(again).with_share(share)
+    def evaluate(unknown: ArmUnknown, damping: Array, share: Array, loose: Array) -> Damped:
+        problem = whole.loosened(loose).with_share(share)
         at = state_of(unknown.xi, unknown.coupled, problem)
         imbalance = imbalance_of(unknown, at, problem, free)
         step, definite, doubtful = approximate_solve(unknown, at, imbalance, problem, free, damping)

@@ -89,7 +89,7 @@ class Contacts(Coupling):
 
     **Fields:** the `obstacles`, the `rod` and the position of its `base`; the stiffness k, `scale`;
     `flatness` and `lift` of `Surroundings`; the length b, `blur`, and the compliance c, `give`, and
-    both to begin with, `first`; `loose`: 1 where the flatness is that of a second attempt;
+    both to begin with, `first`; `loose`: 1 where the flatness is the larger one;
     the number of `steps`; the coefficients of `friction` and the stiffness c of `slip` on each
     step, `grip` (steps, ...), both None without; `soft`: 1 where the gaps give the forces;
     `traces`: what the contacts remember where the arm follows a path of inputs, None without.
@@ -117,8 +117,8 @@ class Contacts(Coupling):
         obstacles, rod = finite((self.obstacles, self.rod))
         return replace(self, obstacles=obstacles, rod=rod, lift=self.lift + 1e3 * rod.length)
 
-    def loosened(self, again: Array) -> "Contacts":
-        return replace(self, loose=jnp.maximum(self.loose, again.astype(self.loose.dtype)))
+    def loosened(self, loose: Array) -> "Contacts":
+        return replace(self, loose=jnp.maximum(self.loose, loose.astype(self.loose.dtype)))
 
     def as_loose_as(self, other: Coupling) -> "Contacts":
         return self.loosened(other.loose) if isinstance(other, Contacts) else self
@@ -179,7 +179,7 @@ class Contacts(Coupling):
         return loads._replace(around=around)
 
     def _flatness(self) -> Array:
-        """Bulge of a gap that counts as flat: in a second attempt that of the curvature 1 / L."""
+        """Bulge of a gap that counts as flat: if loosened that of the curvature 1 / L."""
         bulge = self.rod.length / (8.0 * self.steps**2)
         rough = jnp.maximum(self.flatness, bulge.astype(self.flatness.dtype))
         return jnp.where(self.loose > 0, rough, self.flatness)

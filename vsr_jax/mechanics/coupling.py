@@ -34,7 +34,7 @@ from ..numerics.stacked import once, total
 from .balance import without_force
 from .reaction import Loading, Reaction
 from .slip import Slip
-from .touch import received
+from .touch import motions_at, received
 
 SOFTENED = (SOFT_STAGES - 0.5) / HARDENING_STAGES
 """Hardness from which constraints have no energy."""
@@ -76,11 +76,11 @@ class ArmProblem(NamedTuple):
         couplings = tuple(coupling.softened(hardness) for coupling in self.couplings)
         return self._replace(loads=self.loads.scaled(jnp.minimum(share, 1.0)), couplings=couplings)
 
-    def loosened(self, again: Array | None) -> "ArmProblem":
-        """The problem that a second attempt solves, where `again` is true."""
-        if again is None or not self.softens:
+    def loosened(self, loose: Array | None) -> "ArmProblem":
+        """The problem that is solved where the given one is not, where `loose` is true."""
+        if loose is None or not self.softens:
             return self
-        return self._replace(couplings=tuple(one.loosened(again) for one in self.couplings))
+        return self._replace(couplings=tuple(one.loosened(loose) for one in self.couplings))
 
     def as_loose_as(self, others: tuple["Coupling", ...]) -> "ArmProblem":
         """The problem with its couplings loosened as those of one that it begins from."""
@@ -212,8 +212,7 @@ class PointForces(NamedTuple):
     def change(self, rows: PyTree, motions: Array) -> PyTree:
         """Changes of the unknowns for given rows and motions in the cells (6, stages, steps,
         ...)."""
-        there = total(self.cell * motions[:, :, None], 1)
-        moved = self.factors * total(self.direction * there, 0)
+        moved = self.factors * total(self.direction * motions_at(self.cell, motions), 0)
         change = (self._listed(rows) - moved) / self.corner
         change = change - received(self.handed, change)
         if self.slip is None:
@@ -262,9 +261,9 @@ class Coupling(eqx.Module):
         is exact; the same by default."""
         return self
 
-    def loosened(self, again: Array) -> "Coupling":
-        """The coupling where a first attempt has failed, with a rougher discretization where
-        `again` is true; the same by default."""
+    def loosened(self, loose: Array) -> "Coupling":
+        """The coupling with a rougher discretization where `loose` is true, for what is not solved
+        without; the same by default."""
         return self
 
     def as_loose_as(self, other: "Coupling") -> "Coupling":

@@ -29,7 +29,7 @@ from ..numerics.component import Vector
 from ..numerics.quadrature import Grid, value_weights
 from ..numerics.stacked import components, matvec, stack, total, transpose
 from .reaction import Reaction
-from .touch import Touch
+from .touch import Touch, motions_at
 
 
 class Sliding(NamedTuple):
@@ -61,8 +61,7 @@ class Sliding(NamedTuple):
     def followed(self, strain: Vector, motions: Array) -> Vector:
         """A change of strain with the shear by motions in the cells."""
         touch = self.touch
-        there = total(touch.cell * motions[:, :, None], 1)
-        slope = touch.slide * total(touch.sliding * there, 0)
+        slope = touch.slide * total(touch.sliding * motions_at(touch.cell, motions), 0)
         return _with_force(strain, self.compliance * self._forces(slope))
 
     def _forces(self, slope: Array) -> Array:

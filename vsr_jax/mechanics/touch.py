@@ -227,6 +227,11 @@ def contact_wrenches(touch: Touch) -> Array:
     return jnp.concatenate([jnp.zeros_like(push) if moment is None else beyond(moment), push])
 
 
+def motions_at(cell: Array, motions: Array) -> Array:
+    """Motions (6, n, steps, *arms) of what lies in given cells, from those of all cells."""
+    return total(cell * motions[:, :, None], 1)
+
+
 def touch_slopes(touch: Touch) -> Array:
     """Derivatives (6, 6, obstacles, steps, *arms) of the contact wrenches by the motions of the
     arm there, about the nodes of their cells."""

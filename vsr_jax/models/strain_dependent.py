@@ -116,8 +116,8 @@ class StrainDependent(SteppedModel):
     def _solve_together(
         self, scene: Scene, problem: ArmProblem, guess: ArmUnknown | None = None
     ) -> Outcome:
-        unknown, balanced, definite, steps, again = solve_arm(problem, scene.free, guess)
-        problem = problem.loosened(again)
+        unknown, balanced, definite, steps, loose = solve_arm(problem, scene.free, guess)
+        problem = problem.loosened(loose)
         tau, sections = carried_forces(unknown, problem), problem.sections
         if problem.loads is not None and problem.loads.discs is not None:
             sections = problem.loads.discs.beside(sections)

@@ -42,14 +42,14 @@ class Iterate(NamedTuple):
 
 class Root(NamedTuple):
     """Result of a root search: the point, whether the residual vanishes there, whether the tangent
-    is positive definite there, the number of evaluations, and whether a later attempt found it,
-    where that solves another problem."""
+    is positive definite there, the number of evaluations, and whether it is that of a loosened
+    problem, where there is one."""
 
     x: Any
     converged: Array
     definite: Array
     steps: Array
-    again: Array | None = None
+    loose: Array | None = None
 
 
 def newton(evaluate: Callable[[Any], Evaluation], start: Any, floor: Array) -> Iterate:
