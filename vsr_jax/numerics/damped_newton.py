@@ -142,7 +142,7 @@ def damped_newton(
         trial = jax.tree.map(lambda a, s: jnp.where(old.fresh, a - s.astype(a.dtype), a), x, step)
         turn = measures.turn(step)
         slow = old.gradual & (not twice)
-        little = (old.size < _SETTLED) | (~slow & (turn < _SETTLED))
+        little = (old.size < _SETTLED) | (~slow & (turn < _SETTLED)) if stages else None
         damping, applied = rules.attempt(old, little, plain, increments, levels)
         share = jnp.minimum(applied / increments, 1.0)
         if stages:

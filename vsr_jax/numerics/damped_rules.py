@@ -147,13 +147,14 @@ def probed(old: Guard, probe: Array, ratio: Array) -> Guard:
 
 
 def attempt(
-    old: Guard, little: Array, plain: Array, increments: int, levels: int
+    old: Guard, little: Array | None, plain: Array, increments: int, levels: int
 ) -> tuple[Array, Array]:
     """Damping and load increments of the next evaluation: less and more than before if the last
-    step may be tried; a stage ends with an undamped step that is a `little` one."""
+    step may be tried. A stage, where there are any, ends with an undamped step that is a `little`
+    one."""
     damping = jnp.where(old.fresh, _lowered(old.damping), old.damping)
     more = jnp.where(old.fresh, jnp.minimum(old.applied + 1, increments), old.applied)
-    if levels > increments:
+    if little is not None:
         settled = old.fresh & (old.damping == 0) & little
         further = jnp.where(old.clear, levels, jnp.minimum(old.applied + 1, levels))
         further = jnp.where(settled, further, old.applied)
