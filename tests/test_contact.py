@@ -171,6 +171,36 @@ def test_soft_arms_do_not_pass_what_they_touch():
     assert float(gap.min()) > -1e-4 * 0.005
 
 
+def test_a_tip_rests_on_what_it_presses():
+    """Nothing but rounding and the smoothing of contact, 1e-9 of the length, is between them."""
+    height, radius = -0.02, 0.005
+    floor = vsr.Plane((0, 0, 1), (0, 0, height))
+    eq = solved(vsr.TipWrench(force=(0, 0, -0.02)), obstacles=floor, model=vsr.StrainDependent(24))
+    assert bool(eq.converged)
+    assert float(jnp.max(eq.contacts.force)) > 1e-3
+    np.testing.assert_allclose(eq.tip[2, 3], height + radius, atol=1e-8 * L)
+
+
+@pytest.mark.slow
+def test_contacts_of_an_arm_along_a_wall_push_only_where_the_gap_is_closed():
+    """In a bent tube, and on a floor from a solution near by: a first solve there fails, and only
+    loosened contacts keep to their places."""
+    arm = rod(young=2e5)
+    line = [[0, 0, 0], [0.07, 0, 0], [0.13, 0.02, 0.01], [0.22, 0.06, 0.04]]
+    push = vsr.TipWrench(force=(-0.02, 0, 0))
+    model = vsr.StrainDependent(24)
+    eq = solved(vsr.Gravity(), push, obstacles=vsr.Tube(0.01, line), arm=arm, model=model)
+    floor = {"obstacles": vsr.Plane((0, 0, 1), (0, 0, -0.02)), "model": model}
+    near = solved(vsr.Gravity(), arm=rod(young=2e5, density=630.0), **floor)
+    lying = solved(vsr.Gravity(), arm=rod(young=2e5, density=636.3), start=near, **floor)
+    for found in (eq, near, lying):
+        assert bool(found.converged)
+        force = np.asarray(found.contacts.force) * L**2 / (3 * stiffness(young=2e5))
+        gap = np.abs(found.contacts.gap) / L
+        assert np.sum(force > 1e-6) > 5
+        assert np.max(np.minimum(gap, force)) < 1e-8
+
+
 def test_a_touching_arm_is_the_free_arm_under_its_contact_force(pressed):
     """The same arm without obstacle, loaded by the contact force: other code, with the force at a
     breakpoint."""
