@@ -184,21 +184,25 @@ def test_the_arrays_of_a_module_that_is_a_profile_are_differentiated_and_batched
     )
 
 
-def test_a_function_that_closes_over_what_is_differentiated_is_refused():
-    def area(rate):
-        return geometry(vsr.Circular(lambda x: 0.01 - rate * x)).area
+def test_what_a_function_closes_over_is_differentiated_and_batched():
+    def tip(rate, offset):
+        radius = vsr.FunctionProfile(lambda x: 0.01 - rate * x)
+        thread = vsr.Tendon(vsr.Function(lambda x: (offset + 0.01 * x, 0.002)))
+        rod = vsr.Rod(0.2, vsr.Circular(radius), vsr.Material(1e6, poisson=0.5))
+        scene = vsr.Scene(rod, [thread])
+        return vsr.solve(scene, [1.0], model=vsr.StrainDependent(steps=4)).tip[0, 3]
 
-    message = (
-        r"FunctionProfile\.function: got a function that takes rate from around it, which JAX "
-        r"transforms; need it as a parameter: FunctionProfile\(function, rate\) with function\(X, "
-        r"rate\)"
-    )
-    for transformed in (jax.grad(area), jax.jit(area)):
-        with pytest.raises(ValueError, match=message):
-            transformed(0.01)
-    rate = jnp.asarray(0.01)  # a constant
-    area = geometry(vsr.Circular(lambda x: 0.01 - rate * x)).area
-    np.testing.assert_allclose(area, np.pi * 0.007**2, rtol=1e-13)
+    at, both = jnp.array([0.01, 0.004]), jax.grad(tip, (0, 1))
+    value, sizes = jax.jit(tip), np.array([1e-5, 1e-6])
+    expected = [
+        (value(*(at + move)) - value(*(at - move))) / (2 * size)
+        for move, size in zip(np.diag(sizes), sizes, strict=True)
+    ]
+    for slopes in (both(*at), jax.jit(both)(*at)):
+        np.testing.assert_allclose(slopes, expected, rtol=1e-5)
+    for batched in (jax.vmap(both), jax.jit(jax.vmap(both))):
+        slopes = batched(jnp.array([0.012, at[0]]), jnp.full(2, at[1]))
+        np.testing.assert_allclose([slope[1] for slope in slopes], expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize(

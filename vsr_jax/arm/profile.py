@@ -15,7 +15,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
 from ..typing import ArrayLike, Scalar, Tree, VectorLike
@@ -39,8 +38,7 @@ class FunctionOfX(eqx.Module):
       differentiated.
     - `parameters`: pytrees of arrays, for example equinox modules; differentiable.
 
-    **Raises:** `ValueError` for what is no function, and for one whose closure holds a number that
-    is differentiated, batched or compiled, and needs to be a parameter.
+    **Raises:** `ValueError` for what is no function.
     """
 
     function: Callable = eqx.field(static=True)
@@ -49,13 +47,6 @@ class FunctionOfX(eqx.Module):
     def __init__(self, owner: str, function: Callable, *parameters: PyTree):
         if not callable(function):
             raise ValueError(f"{owner}.function: got {function!r}, need a function of X")
-        traced = _traced_in(function)
-        if traced:
-            raise ValueError(
-                f"{owner}.function: got a function that takes {' and '.join(traced)} from around "
-                f"it, which JAX transforms; need it as a parameter: "
-                f"{owner}(function, {', '.join(traced)}) with function(X, {', '.join(traced)})"
-            )
         if isinstance(function, eqx.Module):
             function, parameters = _call, (function, *parameters)
         self.function = function
@@ -78,20 +69,6 @@ class FunctionOfX(eqx.Module):
 def _call(X: Scalar, function: Callable, *parameters: PyTree) -> PyTree:
     """Value of a function that is itself a parameter."""
     return function(X, *parameters)
-
-
-def _traced_in(function: Callable) -> list[str]:
-    """Names of what a function takes from around it and JAX transforms."""
-    code, cells = getattr(function, "__code__", None), getattr(function, "__closure__", None)
-    found = []
-    for name, cell in zip(code.co_freevars if code else (), cells or (), strict=True):
-        try:
-            leaves = jax.tree.leaves(cell.cell_contents)
-        except ValueError:  # a name that has no value yet
-            continue
-        if any(isinstance(leaf, Tracer) for leaf in leaves):
-            found.append(name)
-    return found
 
 
 class Profile(Part):

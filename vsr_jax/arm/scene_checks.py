@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from ..numerics.magnus import step_poses
 from ..numerics.quadrature import make_grid
 from ..typing import Scalar
-from ..validation import ROUNDING, concrete, numbers
+from ..validation import ROUNDING, concrete, is_traced, numbers
 from .actuator import Actuator
 from .discs import check_discs
 from .held import Held
@@ -43,10 +43,10 @@ def check_numbers(
     """
     length = float(numbers("Scene.rod.length", rod.length, positive=True))
     _check_places(length, rod, actuators, loads)
-    probe = jax.tree.map(concrete, _probe(rod, tuple(actuators), edges()))
-    if probe[0] is None:
+    probe = _probe(rod, tuple(actuators), edges())
+    if any(map(is_traced, jax.tree.leaves(probe))):
         return
-    X, limited, clearances = probe
+    X, limited, clearances = jax.tree.map(np.asarray, probe)
     for (name, needed), (values, room) in limited.items():
         if not np.all(room > 0):
             i, unit = int(np.argmin(room)), " m" if name.startswith("section") else ""
