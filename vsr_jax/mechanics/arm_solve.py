@@ -23,6 +23,7 @@ from ..numerics.damped_newton import LOAD_INCREMENTS, MAX_TURN, damped_newton
 from ..numerics.damped_rules import HARDENING_STAGES, Damped, Measures
 from ..numerics.implicit import implicit_root
 from ..numerics.newton import Root
+from ..numerics.stacked import once
 from ..typing import cast
 from .arm_balance import ArmImbalance, ArmUnknown, imbalance_of, rounding_of, state_of
 from .arm_tangent import approximate_solve, tangent_solve
@@ -249,7 +250,7 @@ def _iteration(
         slides = problem.dissipates
         if slides is not None:  # no pivot tells then
             definite, doubtful = definite | slides, doubtful & ~slides
-        step = _followed(step, unknown, imbalance, problem, free)
+        step = jax.tree.map(once, _followed(step, unknown, imbalance, problem, free))
         size = sizes.of_step(step, at)
         # A step that coils the arm may lower the residual without approaching a solution.
         cut = jnp.minimum(1.0, MAX_TURN / jnp.maximum(sizes.turn(step), MAX_TURN))

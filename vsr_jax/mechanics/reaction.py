@@ -250,7 +250,7 @@ def rotations(k: Array, h: Array, base: Array | None) -> tuple[Array, Array, Arr
     # within each step up to its nodes, and up to its end
     parts = jnp.append(jnp.asarray(gauss_legendre(k.shape[1])[0], h.dtype), 1.0)
     within_step = stacked_rotation(
-        partial_rotation(k[:, :, None], h, parts.reshape(-1, *(1,) * h.ndim))
+        once(partial_rotation(k[:, :, None], h, parts.reshape(-1, *(1,) * h.ndim)))
     )
     whole = jnp.moveaxis(within_step[:, :, -1], 2, 0)
     matrix = base_pose(base, h.dtype)[:3, :3]
