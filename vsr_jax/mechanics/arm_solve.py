@@ -60,7 +60,7 @@ def solve_arm(problem: ArmProblem, free: tuple[int, ...], guess: ArmUnknown | No
     def find(problem: ArmProblem, guess: ArmUnknown | None) -> Root:
         if guess is not None:  # the iteration does not change the locked strains
             guess = guess._replace(xi=with_locked(guess.xi, problem.sections, free))
-        together = _QUEUED if problem.softens else TOGETHER
+        together = _QUEUED if _uneven(problem) else TOGETHER
         root = side_by_side(partial(_solve, free), together)(_start(problem, free), guess, problem)
         return root._replace(x=root.x._replace(xi=free_components(root.x.xi, free)))
 
@@ -215,7 +215,7 @@ def _solve(
 ) -> Root:
     arms = arms_in((origin, guess, whole), whole.grid.h.ndim - 1)
     given = whole, origin, guess, jnp.broadcast_to(rounding_of(whole), arms)
-    if whole.softens and arms and arms[0] > _LANES:
+    if _uneven(whole) and arms and arms[0] > _LANES:
         root = queued(partial(_iteration, free, (_LANES,)), given, arms[0], _LANES)
     else:
         root = iterated(_iteration(free, arms, given))
@@ -226,6 +226,13 @@ def _solve(
     imbalance = imbalance_of(root.x, at, whole, free)
     _, definite, _ = approximate_solve(root.x, at, imbalance, whole, free, symmetric=True)
     return root._replace(definite=definite)
+
+
+def _uneven(problem: ArmProblem) -> bool:
+    """Whether some arms of a batch may need several times as many steps as most."""
+    loads = problem.loads
+    turning = loads is not None and loads.discs is not None and not loads.only_discs
+    return problem.softens or turning
 
 
 def _iteration(

@@ -8,21 +8,22 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from ..numerics import component as c
-from ..numerics.component import Vector
+from ..numerics.component import Matrix, Vector
+from ..numerics.quadrature import Grid
 from ..typing import cast
 from .arm_balance import ArmImbalance, ArmUnknown
 from .balance import free_components, spread, tangent
-from .coupling import ArmProblem, ArmState, bordered_solve, borders_of, points_of
+from .coupling import ArmProblem, ArmState, Border, bordered_solve, borders_of, points_of
 from .elimination import eliminate
 from .elimination_nodes import Definiteness
 from .pose_elimination import eliminate_poses, motions
-from .reaction import slopes_of
+from .reaction import Reaction, Slopes, slopes_of
 from .sizes import node_weight
 from .sliding import sliding_of
-from .springs import with_springs
+from .springs import Solve, solve_both, with_springs
 
 _REFINEMENTS = 60
 """Bound on the refinement steps of a tangent system; 5 to 10 are usual."""
@@ -44,10 +45,15 @@ def approximate_solve(
     damping: Array | float = 0.0,
     *,
     symmetric: bool = False,
+    apart: bool = False,
 ) -> tuple[ArmUnknown, Array, Array]:
     """Approximate solution of the tangent system (see `elimination`; a coupling without a border
     has the tangent 1), whether it is definite for the changes of shape that the couplings allow,
-    and whether that is doubtful; `symmetric`: with the contact forces that friction follows held.
+    and whether that is doubtful.
+
+    **Arguments:** `symmetric`: with the contact forces that friction follows held; `apart`: solve
+    for `right` apart from all that does not depend on it, in place of one pass for everything, so
+    that derivatives by `right` repeat only the former.
 
     In single precision: the passes along the arm are bound by memory, and rounding is far below the
     error of the elimination. Two keep the precision of the unknowns: straight tendons of an arm
@@ -85,27 +91,18 @@ def approximate_solve(
         cells, part = springs.slopes(slopes.contacts)
         slopes = slopes._replace(cells=cells, part=part)
 
-    def solve(b: Vector, *push: Array) -> tuple[Vector, Definiteness]:
-        if along is not None and slopes is not None and slopes.motion == 6:
-            return eliminate_poses(lower, b, along, slopes, grid, free, flexible, *push)
-        return eliminate(lower, b, along, slopes, grid, free, flexible)
-
+    solve = _elimination(lower, along, slopes, grid, free, flexible)
     if along is not None and loads is not None and pull is not None:
         springs = pull.springs(along.rotation, cut=loads.only_discs)
-        solve = with_springs(solve, springs, grid)
+        solve = with_springs(solve, springs, grid, apart=apart)
     b = spread(right.wrench, free)
     if sliding is not None:
         b, more = sliding.driven(b)
         pushes = [push + more for push in pushes]
-    strain, (negative, doubtful) = solve(b, *pushes)
-    coupled, (borders, border) = list(right.coupled), borders_of(problem, unknown.coupled, at)
-    if border is not None:
-        parts = [right.coupled[place] for place in borders]
-        rows = jnp.concatenate(parts)
-        strain, x, held = bordered_solve(lambda b: solve(b)[0], strain, rows, border, grid)
-        negative, first = negative - held, 0
-        for place, part in zip(borders, parts, strict=True):
-            coupled[place], first = x[first : first + len(part)], first + len(part)
+    borders = borders_of(problem, unknown.coupled, at)
+    strain, coupled, (negative, doubtful) = _bordered(
+        solve, b, pushes, right.coupled, borders, grid, apart=apart
+    )
     for place, one in points.items():
         assert along is not None
         assert slopes is not None
@@ -115,6 +112,58 @@ def approximate_solve(
         if sliding is not None:
             strain = sliding.followed(strain, moved)
     return ArmUnknown(strain, tuple(coupled)), negative == 0, doubtful
+
+
+def _elimination(
+    lower: Matrix,
+    along: Reaction | None,
+    slopes: Slopes | None,
+    grid: Grid,
+    free: tuple[int, ...],
+    flexible: Array | None,
+) -> Solve:
+    """The elimination for several right sides, and what pushes each of them."""
+
+    def one(b: Vector, *push: Array) -> tuple[Vector, Definiteness]:
+        if along is not None and slopes is not None and slopes.motion == 6:
+            return eliminate_poses(lower, b, along, slopes, grid, free, flexible, *push)
+        return eliminate(lower, b, along, slopes, grid, free, flexible)
+
+    def solve(b: Vector, *push: Array) -> tuple[Vector, Definiteness]:
+        if len(b[0]) == 1:
+            found, definiteness = one(*jax.tree.map(lambda x: x[0], (b, *push)))
+            return tuple(x[None] for x in found), definiteness
+        found, definiteness = jax.vmap(one)(b, *push)
+        return found, jax.tree.map(lambda x: x[0], definiteness)
+
+    return solve
+
+
+def _bordered(
+    solve: Solve,
+    b: Vector,
+    pushes: list[Array],
+    rows: tuple[PyTree, ...],
+    borders: tuple[dict[int, Border], Border | None],
+    grid: Grid,
+    *,
+    apart: bool,
+) -> tuple[Vector, list[PyTree], Definiteness]:
+    """Strain and unknowns of the couplings from the right side and their rows, with the unknowns of
+    those without a border still their rows."""
+    (places, border), coupled = borders, list(rows)
+    sides = [tuple(x[None] for x in b), *(push[None] for push in pushes)]
+    if border is None:
+        found, definiteness = solve(*sides)
+        return tuple(x[0] for x in found), coupled, definiteness
+    found, answers, (negative, doubtful) = solve_both(solve, sides, border.columns, apart=apart)
+    right = jnp.concatenate([rows[place] for place in places])
+    strain, x, held = bordered_solve(tuple(x[0] for x in found), answers, right, border, grid)
+    first = 0
+    for place in places:
+        size = len(rows[place])
+        coupled[place], first = x[first : first + size], first + size
+    return strain, coupled, Definiteness(negative - held, doubtful)
 
 
 def tangent_solve(
@@ -142,7 +191,7 @@ def tangent_solve(
     to_row, to_change = lax.stop_gradient(_units(problem, free, right))
 
     def nearly(b: ArmImbalance) -> ArmUnknown:
-        step, _, _ = approximate_solve(unknown, at, b, problem, free)
+        step, _, _ = approximate_solve(unknown, at, b, problem, free, apart=True)
         return _free_part(cast(step, problem.grid.h.dtype), free)
 
     def scaled_apply(x: Array) -> Array:

@@ -16,7 +16,6 @@ arms of a batch in further axes at their end.
 """
 
 from abc import abstractmethod
-from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -403,7 +402,7 @@ def borders_of(
     found = {i: border for i, border in enumerate(each) if border is not None}
     if not found:
         return found, None
-    return found, jax.tree.map(lambda *parts: _listed(parts), *found.values())
+    return found, jax.tree.map(lambda *parts: listed(parts), *found.values())
 
 
 def points_of(problem: ArmProblem, unknowns: tuple, at: ArmState) -> dict[int, PointForces]:
@@ -415,7 +414,7 @@ def points_of(problem: ArmProblem, unknowns: tuple, at: ArmState) -> dict[int, P
     return {i: points for i, points in enumerate(each) if points is not None}
 
 
-def _listed(parts: tuple[Array, ...]) -> Array:
+def listed(parts: tuple[Array, ...]) -> Array:
     """Arrays (m, ...) one after another, the axes behind of the same sizes."""
     if len(parts) == 1:
         return parts[0]
@@ -424,7 +423,7 @@ def _listed(parts: tuple[Array, ...]) -> Array:
 
 
 def bordered_solve(
-    solve: Callable[[Vector], Vector], strain: Vector, right: Array, border: Border, grid: Grid
+    strain: Vector, answers: Vector, right: Array, border: Border, grid: Grid
 ) -> tuple[Vector, Array, Array]:
     """Solution of a system with a border: the strain, the unknowns of the couplings, and the number
     of negative pivots of the Schur complement.
@@ -432,14 +431,13 @@ def bordered_solve(
     Each negative pivot is an unstable motion of the arm alone that the couplings prevent: the arm
     is stable if its tangent has no more negative eigenvalues than that.
 
-    **Arguments:** `solve`: of the system of the strains; `strain`: its solution for their right
-    side; `right`: that of the couplings, shape (m, ...).
+    **Arguments:** `strain`, `answers`: solutions of the system of the strains for their right side,
+    and for each of the columns; `right`: that of the couplings, shape (m, ...).
     """
 
     def work(rows: Vector, change: Vector) -> Array:
         return jnp.sum(grid.weight * c.dot(rows, change), axis=(-grid.X.ndim, 1 - grid.X.ndim))
 
-    answers = jax.vmap(solve)(border.columns)
     size = len(border.factors)
     given = work(border.rows, strain)
     unit = jnp.eye(size, dtype=right.dtype).reshape(size, size, *(1,) * (right.ndim - 1))

@@ -1,27 +1,31 @@
 """The tangent of an arm with springs between sections far from each other, which the turning chords
 of straight tendons are, from the tangent without them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..numerics import lu
+from ..numerics import component as c, lu
 from ..numerics.component import Vector
 from ..numerics.quadrature import Grid
+from .coupling import listed
 from .elimination_nodes import Definiteness
 
 Solve = Callable[..., tuple[Vector, Definiteness]]
+"""Solution of a tangent system for several right sides, components (k, stages, steps, ...)."""
 
 
-def with_springs(solve: Solve, springs: Vector, grid: Grid) -> Solve:
+def with_springs(solve: Solve, springs: Vector, grid: Grid, *, apart: bool) -> Solve:
     r"""From the `solve` of a tangent A that of $A + \sum_j w_j w_j^T$ (Woodbury's formula).
 
     Its number of negative eigenvalues is that of A, less the number of negative pivots of
     $1 + W^T A^{-1} W$.
-    """
 
+    **Arguments:** `apart`: solve for the springs apart from the right sides.
+    """
     weighted = tuple(grid.weight * w for w in springs)
 
     def work(x: Vector) -> Array:
@@ -29,18 +33,42 @@ def with_springs(solve: Solve, springs: Vector, grid: Grid) -> Solve:
         parts = [jnp.einsum("isn...,sn...->i...", w, v) for w, v in zip(weighted, x, strict=True)]
         return sum(parts[1:], parts[0])
 
-    answers = jax.vmap(lambda b: solve(b)[0])(springs)
-    gram = jax.vmap(work, out_axes=1)(answers)
-    one = jnp.eye(len(gram), dtype=gram.dtype)
-    factors = lu.factor(gram + one.reshape(*one.shape, *(1,) * (gram.ndim - 2)))
-    held = jnp.sum(lu.diagonal(factors) < 0, axis=0, dtype=jnp.int32)
+    def held_by(answers: Vector) -> Array:
+        """The factors of $1 + W^T A^{-1} W$."""
+        gram = jax.vmap(work, out_axes=1)(answers)
+        one = jnp.eye(len(gram), dtype=gram.dtype)
+        return lu.factor(gram + one.reshape(*one.shape, *(1,) * (gram.ndim - 2)))
+
+    known = solve(springs)[0] if apart else None
+    factored = None if known is None else held_by(known)
 
     def stiffer(b: Vector, *push: Array) -> tuple[Vector, Definiteness]:
-        x, (negative, doubtful) = solve(b, *push)
-        force = lu.substitute(factors, work(x))
-        less = (jnp.einsum("j...,jsn...->sn...", force, answer) for answer in answers)
-        return tuple(a - b for a, b in zip(x, less, strict=True)), Definiteness(
-            negative - held, doubtful
-        )
+        answers, factors = known, factored
+        if answers is None or factors is None:
+            x, answers, definiteness = solve_both(solve, (b, *push), springs)
+            factors = held_by(answers)
+        else:
+            x, definiteness = solve(b, *push)
+        force = jax.vmap(partial(lu.substitute, factors), 1, 1)(jax.vmap(work, out_axes=1)(x))
+        less = (jnp.einsum("jk...,jsn...->ksn...", force, answer) for answer in answers)
+        held = jnp.sum(lu.diagonal(factors) < 0, axis=0, dtype=jnp.int32)
+        negative, doubtful = definiteness
+        return c.subtract(x, tuple(less)), Definiteness(negative - held, doubtful)
 
     return stiffer
+
+
+def solve_both(
+    solve: Solve, sides: Sequence, columns: Vector, *, apart: bool = False
+) -> tuple[Vector, Vector, Definiteness]:
+    """Solutions for right sides and what pushes them, and for columns that nothing pushes;
+    `apart`: each by a pass of its own."""
+    b, *pushes = sides
+    if apart:
+        found, definiteness = solve(b, *pushes)
+        return found, solve(columns)[0], definiteness
+    count, more = len(b[0]), len(columns[0])
+    pushes = (jnp.pad(push, [(0, more), *[(0, 0)] * (push.ndim - 1)]) for push in pushes)
+    both = tuple(map(listed, zip(b, columns, strict=True)))
+    found, definiteness = solve(both, *pushes)
+    return tuple(x[:count] for x in found), tuple(x[count:] for x in found), definiteness
