@@ -9,6 +9,7 @@ from jax.flatten_util import ravel_pytree
 
 import vsr_jax as vsr
 from vsr_jax.arm.routing import Routing
+from vsr_jax.mechanics import arm_tangent
 
 ARM = vsr.Rod(0.3, vsr.Circular(0.01), vsr.Material(1e6, poisson=0.45, density=1000.0))
 STEPS = vsr.StrainDependent(8)
@@ -261,6 +262,21 @@ def test_forward_mode_is_reverse_mode():
     np.testing.assert_allclose(
         jax.jit(jax.jacfwd(height))(at), jax.jit(jax.jacrev(height))(at), rtol=1e-8
     )
+
+
+@pytest.mark.slow
+def test_reverse_mode_with_friction_takes_few_refinement_steps(monkeypatch):
+    """Twenty here, and sixty on a soft arm, where its unknowns did not follow the strain."""
+    monkeypatch.setattr(arm_tangent, "_REFINEMENTS", 12)
+    model, at = vsr.StrainDependent(5), jnp.array([6.0, 2.0])  # a program of its own
+
+    def height(x):
+        return vsr.solve(scene([vsr.Gravity()], friction=0.6), x, model=model).tip[2, 3]
+
+    value, slopes = jax.jit(jax.value_and_grad(height))(at)
+    assert np.isfinite(value)
+    expected = [(height(at + h) - height(at - h)) / 2e-4 for h in 1e-4 * jnp.eye(2)]
+    np.testing.assert_allclose(slopes, expected, rtol=1e-6)
 
 
 @pytest.mark.slow

@@ -192,7 +192,7 @@ def tangent_solve(
 
     def nearly(b: ArmImbalance) -> ArmUnknown:
         step, _, _ = approximate_solve(unknown, at, b, problem, free, apart=True)
-        return _free_part(cast(step, problem.grid.h.dtype), free)
+        return _followed(_free_part(cast(step, problem.grid.h.dtype), free), b, apply, problem)
 
     def scaled_apply(x: Array) -> Array:
         return to_row * ravel_pytree(apply(unravel_change(to_change * x)))[0]
@@ -216,6 +216,24 @@ def tangent_solve(
     return unravel_change(
         to_change * lax.custom_linear_solve(scaled_apply, b, solve, transpose_solve)
     )
+
+
+def _followed(
+    step: ArmUnknown, right: ArmImbalance, apply: Callable, problem: ArmProblem
+) -> ArmUnknown:
+    """The step, with the unknowns of couplings that follow from the strain changed by its step too.
+
+    With the tangent 1 alone the transposed system took sixty refinement steps in place of eight."""
+    late = [i for i, one in enumerate(problem.couplings) if one.follows_rate]
+    if not late:
+        return step
+    coupled = list(step.coupled)
+    for i in late:
+        coupled[i] = jax.tree.map(jnp.zeros_like, coupled[i])
+    rows = apply(step._replace(coupled=tuple(coupled))).coupled
+    for i in late:
+        coupled[i] = jax.tree.map(jnp.subtract, right.coupled[i], rows[i])
+    return step._replace(coupled=tuple(coupled))
 
 
 def _free_part(unknown: ArmUnknown, free: tuple[int, ...]) -> ArmUnknown:
