@@ -51,14 +51,14 @@ def approximate_solve(
     has the tangent 1), whether it is definite for the changes of shape that the couplings allow,
     and whether that is doubtful.
 
-    **Arguments:** `symmetric`: with the contact forces that friction follows held; `apart`: solve
-    for `right` apart from all that does not depend on it, in place of one pass for everything, so
-    that derivatives by `right` repeat only the former.
-
     In single precision: the passes along the arm are bound by memory, and rounding is far below the
     error of the elimination. Two keep the precision of the unknowns: straight tendons of an arm
     with loads, whose forces without their turning, which the elimination takes first, are large
     enough to make its pivots singular, and contacts, which are nearly rigid.
+
+    **Arguments:** `symmetric`: with the contact forces that friction follows held; `apart`: solve
+    for `right` apart from all that does not depend on it, in place of one pass for everything, so
+    that derivatives by `right` repeat only the former.
     """
     loads = at.loads
     if loads is None or (loads.around is None and (loads.discs is None or loads.only_discs)):
