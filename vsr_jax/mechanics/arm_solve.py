@@ -26,7 +26,7 @@ from ..numerics.newton import Root
 from ..numerics.stacked import once
 from ..typing import cast
 from .arm_balance import ArmImbalance, ArmUnknown, imbalance_of, rounding_of, state_of
-from .arm_tangent import approximate_solve, tangent_solve
+from .arm_tangent import approximate_solve, followed, tangent_solve
 from .balance import (
     completed,
     free_components,
@@ -178,36 +178,17 @@ class _Sizes(NamedTuple):
         return jnp.max(jnp.abs(x), axis=self._inner(x))
 
 
-def _followed(
-    step: ArmUnknown,
-    unknown: ArmUnknown,
-    imbalance: ArmImbalance,
-    problem: ArmProblem,
-    free: tuple[int, ...],
-) -> ArmUnknown:
-    r"""The step, with the unknowns of couplings that follow from the strain changed by its step
-    too: $\delta x = s - \partial s / \partial\xi \, \delta\xi$ for their rows s.
-
-    With $\delta x = s$ they would be one step late: twice as many steps, or none that converge."""
-    if not problem.follows_rate:
-        return step
-    late = [i for i, one in enumerate(problem.couplings) if one.follows_rate]
+def _changes(
+    unknown: ArmUnknown, problem: ArmProblem, free: tuple[int, ...], step: ArmUnknown
+) -> tuple:
+    """Changes of the rows of all couplings by the strain of a step alone."""
 
     def rows(xi: Vector) -> tuple:
         at = state_of(xi, unknown.coupled, problem)
-        found = imbalance_of(ArmUnknown(xi, unknown.coupled), at, problem, free).coupled
-        return tuple(found[i] for i in late)
+        return imbalance_of(ArmUnknown(xi, unknown.coupled), at, problem, free).coupled
 
     _, changes = jax.jvp(rows, (unknown.xi,), (cast(step.xi, problem.grid.h.dtype),))
-    coupled = list(step.coupled)
-    for i, change in zip(late, changes, strict=True):
-        coupled[i] = jax.tree.map(
-            lambda x, row, by: (row - by).astype(x.dtype),
-            coupled[i],
-            imbalance.coupled[i],
-            change,
-        )
-    return step._replace(coupled=tuple(coupled))
+    return jax.tree.map(once, changes)
 
 
 def _solve(
@@ -257,7 +238,7 @@ def _iteration(
         slides = problem.dissipates
         if slides is not None:  # no pivot tells then
             definite, doubtful = definite | slides, doubtful & ~slides
-        step = jax.tree.map(once, _followed(step, unknown, imbalance, problem, free))
+        step = followed(step, imbalance, partial(_changes, unknown, problem, free), problem)
         size = sizes.of_step(step, at)
         # A step that coils the arm may lower the residual without approaching a solution.
         cut = jnp.minimum(1.0, MAX_TURN / jnp.maximum(sizes.turn(step), MAX_TURN))

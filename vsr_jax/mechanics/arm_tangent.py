@@ -192,7 +192,8 @@ def tangent_solve(
 
     def nearly(b: ArmImbalance) -> ArmUnknown:
         step, _, _ = approximate_solve(unknown, at, b, problem, free, apart=True)
-        return _followed(_free_part(cast(step, problem.grid.h.dtype), free), b, apply, problem)
+        step = _free_part(cast(step, problem.grid.h.dtype), free)
+        return followed(step, b, lambda step: apply(step).coupled, problem)
 
     def scaled_apply(x: Array) -> Array:
         return to_row * ravel_pytree(apply(unravel_change(to_change * x)))[0]
@@ -218,21 +219,29 @@ def tangent_solve(
     )
 
 
-def _followed(
-    step: ArmUnknown, right: ArmImbalance, apply: Callable, problem: ArmProblem
+def followed(
+    step: ArmUnknown, right: ArmImbalance, changes: Callable, problem: ArmProblem
 ) -> ArmUnknown:
-    """The step, with the unknowns of couplings that follow from the strain changed by its step too.
+    r"""The step, with the unknowns of couplings that follow from the strain changed by its step
+    too: $\delta x = s - \partial s / \partial\xi \, \delta\xi$ for their rows s.
 
-    With the tangent 1 alone the transposed system took sixty refinement steps in place of eight."""
+    With $\delta x = s$ they would be one step late: twice as many Newton steps, or none that
+    converge, and up to sixty refinement steps of the transposed system in place of eight.
+
+    **Arguments:** `right`: the right side of the tangent system; `changes`: of the rows of all
+    couplings by a step without these unknowns.
+    """
     late = [i for i, one in enumerate(problem.couplings) if one.follows_rate]
     if not late:
         return step
     coupled = list(step.coupled)
     for i in late:
         coupled[i] = jax.tree.map(jnp.zeros_like, coupled[i])
-    rows = apply(step._replace(coupled=tuple(coupled))).coupled
+    rows = changes(step._replace(coupled=tuple(coupled)))
     for i in late:
-        coupled[i] = jax.tree.map(jnp.subtract, right.coupled[i], rows[i])
+        coupled[i] = jax.tree.map(
+            lambda x, row, by: (row - by).astype(x.dtype), coupled[i], right.coupled[i], rows[i]
+        )
     return step._replace(coupled=tuple(coupled))
 
 
