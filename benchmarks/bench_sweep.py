@@ -1,13 +1,13 @@
-"""Speed of sweeps by samples, nodes, threads, sections, loads and devices; the limit of the
+"""Speed of sweeps by samples, nodes, threads, sections, loads and cores; the limit of the
 machine; a sweep of a million shapes, killed and resumed.
 
     pip install ".[sweep]" && python benchmarks/bench_sweep.py
         [--json FILE] [--plot FILE] [--million]
 
 Unless a row states otherwise, the arm is the paper's B1 with one helical thread, at 16 steps of
-order 6, with tensions from [0, 15] N, and each core of the CPU is a device, as in `vsr-jax sweep`.
-All rates are those of `vsr.sweep` without compilation, including copies to and from the devices:
-medians of several runs in turn, with the slowest and the fastest.
+order 6, with tensions from [0, 15] N. All rates are those of `vsr.sweep` without compilation,
+including copies to and from the device: medians of several runs in turn, with the slowest and the
+fastest; those by cores are of a process each.
 
 `--million` sweeps a million shapes to disk in a separate process, kills it at a random time,
 resumes the sweep in another process, and compares the store with that of an uninterrupted sweep.
@@ -28,15 +28,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from matplotlib.figure import Figure
 
 import vsr_jax as vsr
-from vsr_jax.cli.common import one_device_per_core
 from vsr_jax.mechanics.balance import newton_step
 from vsr_jax.studies.timing import Timed, machine, take_turns
-
-one_device_per_core()
 
 SAMPLES = 16_384
 STEPS = 16
@@ -52,6 +48,19 @@ import vsr_jax as vsr
 model = vsr.StrainDependent(b.STEPS)
 result = vsr.sweep(b.helix(), b.tensions(samples), model=model, out=path, progress=False)
 print(1024 * int(re.search(r"VmHWM:\\s*(\\d+)", Path("/proc/self/status").read_text())[1]))
+"""
+
+ON_CORES = """
+import json, os, sys
+os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: int(sys.argv[1])])
+import jax; jax.config.update("jax_enable_x64", True)
+import bench_sweep as b
+loads = {"no loads": (), "gravity": (b.vsr.Gravity(),)}
+jobs = {
+    f"{what}, {sys.argv[1]} cores": (b.job(b.helix(loads=each), b.tensions(n)), n)
+    for (what, each), n in zip(loads.items(), (8 * b.SAMPLES, b.SAMPLES // 4))
+}
+print(json.dumps(b.rates(jobs)))
 """
 
 
@@ -81,19 +90,12 @@ def place(eq: vsr.Equilibrium) -> dict[str, Any]:
     return {"tip": eq.tip[:3, 3]}
 
 
-def job(
-    scene: vsr.Scene, inputs: np.ndarray, steps: int = STEPS, devices: Any = None
-) -> Callable[[], Any]:
+def job(scene: vsr.Scene, inputs: np.ndarray, steps: int = STEPS) -> Callable[[], Any]:
     """A sweep that has run once, so that it is compiled."""
 
     def run() -> Any:
         return vsr.sweep(
-            scene,
-            inputs,
-            outputs=place,
-            model=vsr.StrainDependent(steps),
-            devices=devices,
-            progress=False,
+            scene, inputs, outputs=place, model=vsr.StrainDependent(steps), progress=False
         )
 
     run()
@@ -152,16 +154,34 @@ def studies() -> dict[str, list[dict[str, Any]]]:
             few,
         ),
     }
-    devices = jax.local_devices()
-    by["devices"] = {
-        f"{n} devices": (job(helix(), many, devices=devices[:n]), SAMPLES)
-        for n in range(1, len(devices) + 1)
-    }
     found = {}
     for name, jobs in by.items():
         print(f"\nby {name}")
         found[name] = rates(jobs, 3 if name == "samples" else ROUNDS)
+    print("\nby cores")
+    cores = len(os.sched_getaffinity(0))
+    found["cores"] = [row for n in dict.fromkeys((1, cores)) for row in on_cores(n)]
     return found
+
+
+def on_cores(number: int) -> list[dict[str, Any]]:
+    """Rates with and without gravity in a process that uses some cores only."""
+    done = subprocess.run(
+        [sys.executable, "-c", ON_CORES, str(number)],
+        env=environment(),
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+    )
+    *printed, last = done.stdout.splitlines()
+    print("\n".join(printed))
+    return json.loads(last)
+
+
+def environment() -> dict[str, str]:
+    """Environment of a process that imports this file."""
+    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    return {**os.environ, "PYTHONPATH": path}
 
 
 def limit(batch_size: int = 512) -> dict[str, float]:
@@ -196,7 +216,7 @@ def _most_operations(
     chains: int = 4, depth: int = 32, size: int = 65_536, times: int = 200
 ) -> float:
     """Operations per second of chains of fused multiply-adds that stay in the registers, on all
-    devices at once."""
+    cores at once."""
 
     def body(_: int, x: jax.Array) -> jax.Array:
         y = [x * (1 + 1e-3 * i) for i in range(chains)]
@@ -207,32 +227,18 @@ def _most_operations(
     def chain(x: jax.Array) -> jax.Array:
         return jax.lax.fori_loop(0, times, body, x)
 
-    mesh = Mesh(np.array(jax.local_devices()), ("parts",))
-    spread = jax.jit(
-        jax.shard_map(
-            chain,
-            mesh=mesh,
-            in_specs=PartitionSpec("parts"),
-            out_specs=PartitionSpec("parts"),
-            check_vma=False,
-        )
-    )
-    x = jnp.linspace(0.9, 1.0, size * mesh.devices.size)
-    job = Timed(spread, jax.device_put(x, NamedSharding(mesh, PartitionSpec("parts"))))
+    x = jnp.linspace(0.9, 1.0, size * len(os.sched_getaffinity(0)))
+    job = Timed(jax.jit(chain), x)
     take_turns([job], 9)
     return 2e6 * chains * depth * times * x.size / job.summary()["median_us"]
 
 
 def million(samples: int = MILLION) -> dict[str, Any]:
     """A sweep to disk that is killed and resumed, compared with an uninterrupted one."""
-    environment = {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path]),
-    }
 
     def start(path: Path) -> subprocess.Popen:
         arguments = [sys.executable, "-c", CHILD, str(path), str(samples)]
-        return subprocess.Popen(arguments, env=environment, stdout=subprocess.PIPE, text=True)
+        return subprocess.Popen(arguments, env=environment(), stdout=subprocess.PIPE, text=True)
 
     def finish(path: Path) -> tuple[float, int]:
         begun = time.perf_counter()
@@ -294,7 +300,7 @@ def draw(found: dict[str, list[dict[str, Any]]], path: str) -> None:
             ax.set(xscale="log", yscale="log")
         else:
             ax.bar(names, rate[0], yerr=spread, color="#0072B2", capsize=3)
-            ax.tick_params(axis="x", labelrotation=20 if name.startswith("precision") else 0)
+            ax.tick_params(axis="x", labelrotation=0 if all(map(str.isdigit, names)) else 20)
         ax.set(xlabel=name, ylabel="shapes per second")
         ax.grid(axis="y", alpha=0.3)
     figure.savefig(path, dpi=150)
@@ -315,9 +321,8 @@ def main() -> None:
     report: dict[str, Any] = {
         "machine": machine(),
         "jax": jax.__version__,
-        "devices": jax.local_device_count(),
     }
-    print(f"{report['machine']}, jax {report['jax']}, {report['devices']} devices")
+    print(f"{report['machine']}, jax {report['jax']}")
     report["limit"] = limit()
     report["rates"] = studies()
     fastest = max(row["per_s"] for row in report["rates"]["samples"])

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import vsr_jax as vsr
-from vsr_jax.analysis import sweep_store as archive
+from vsr_jax.analysis import sweep_program, sweep_store as archive
 from vsr_jax.analysis.sweep_labels import labels
 from vsr_jax.analysis.sweep_program import Task
 from vsr_jax.files.scene_file import parse_scene
@@ -60,6 +60,26 @@ def test_chunks_change_no_bit(expected):
     assert result.converged.all()
     assert result.counts == {"converged": 23}
     assert repr(result) == "Sweep(23 converged; tip (23, 4, 4))"
+
+
+def test_cores_change_no_bit(monkeypatch):
+    monkeypatch.setattr(sweep_program, "BATCH_SIZE", 4)
+    tips = []
+    for cores in (1, 3):
+        monkeypatch.setattr(sweep_program, "cores", lambda cores=cores: cores)
+        result = vsr.sweep(arm(0.006), inputs, model=MODEL, chunk=9, progress=False)
+        assert result.converged.all()
+        tips.append(result["tip"])
+    np.testing.assert_array_equal(*tips)
+
+
+def test_an_error_in_a_thread_ends_the_sweep(monkeypatch):
+    def broken(self, samples, count):
+        raise RuntimeError("out of memory")
+
+    monkeypatch.setattr(sweep_program.Program, "_solve", broken)
+    with pytest.raises(RuntimeError, match="out of memory"):
+        vsr.sweep(arm(0.006), inputs, model=MODEL, chunk=5, progress=False)
 
 
 def test_a_bad_sample_changes_no_other(expected):

@@ -110,6 +110,22 @@ def test_vmap_is_the_loop(name, helix):
     )
 
 
+def test_a_batch_in_parts_is_the_loop(helix):
+    model = vsr.StrainDependent(1)
+    taus = jnp.linspace(-15.0, 5.0, 1030)[:, None]  # more than are solved together
+
+    def height(radius, tau):
+        scene = eqx.tree_at(lambda s: s.actuators[0].routing.radius, helix, radius)
+        return vsr.solve(scene, tau, model=model).tip[2, 3]
+
+    both = jax.value_and_grad(height, argnums=(0, 1))
+    batch = jax.jit(jax.vmap(both, (None, 0)))(0.004, taus)
+    loop = jax.jit(lambda taus: jax.lax.map(lambda tau: both(0.004, tau), taus))(taus)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-13), batch, loop)
+    forward = jax.jit(jax.vmap(jax.jacfwd(height, argnums=1), (None, 0)))(0.004, taus)
+    np.testing.assert_allclose(forward, loop[1][1], atol=1e-13)
+
+
 def test_vmap_over_designs(helix):
     radii = jnp.array([0.003, 0.004, 0.005])
 

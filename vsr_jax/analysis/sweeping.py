@@ -1,9 +1,10 @@
-"""`sweep`: equilibria of any number of samples, in chunks, on all devices and processes, stored in
-memory or on disk."""
+"""`sweep`: equilibria of any number of samples, in chunks, on all cores, devices and processes,
+stored in memory or on disk."""
 
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeAlias
 
 import jax
@@ -90,8 +91,9 @@ def sweep(
         samples = {"radius": radii, "tensions": tensions}
         vsr.sweep(lambda s: (arm(s["radius"]), s["tensions"]), samples, out="designs.zarr")
 
-    One compiled program solves chunk after chunk, a part on each device. If several processes share
-    a `jax.distributed` runtime, each of them calls `sweep` and solves its share of the chunks.
+    One compiled program solves chunk after chunk in batches, on all devices, and on a CPU on all of
+    its cores. If several processes share a `jax.distributed` runtime, each of them calls `sweep`
+    and solves its share of the chunks.
     Samples are independent; the status of each shows whether it converged.
 
     **Arguments:**
@@ -107,8 +109,8 @@ def sweep(
       reads a finished one; results are bit-identical on the same devices.
     - `chunk`: samples per chunk, by default 16,384 on CPUs and 16,384 per device otherwise; an
       existing folder keeps its own.
-    - `memory`: bound [bytes] on the intermediate values of the compiled program; it limits the
-      batch size.
+    - `memory`: bound [bytes] on the intermediate values of all that is solved at once; it limits
+      the batch size.
     - `devices`: devices of this process to use, all by default.
     - `progress`: whether to show a bar with rate and remaining time.
 
@@ -153,23 +155,32 @@ def sweep(
 def _run(program: Program, chunks: list[int], archive: InMemory | Archive, progress: bool) -> None:
     """Solves chunks; each is written while the next one is solved."""
     failed, before = 0, None
-    with tqdm(
+    pool = ThreadPoolExecutor(program.threads, thread_name_prefix="sweep")
+    bar = tqdm(
         total=sum(map(program.samples_in, chunks)),
         unit=" shapes",
         unit_scale=True,
         disable=not progress,
-    ) as bar:
+    )
+    try:
         for index in [*chunks, None]:
-            now = None if index is None else (index, program(index))
+            now = None if index is None else (index, program.begin(index, pool))
             if before is not None:
-                done, outputs = before
-                size = program.samples_in(done)
-                arrays = {name: np.asarray(x)[:size] for name, x in outputs.items()}
+                done, parts = before
+                arrays = _joined([part.result() for part in parts])
                 archive.write(done, arrays)
                 failed += np.count_nonzero(arrays["status"] != Status.CONVERGED)
                 bar.set_postfix(failed=failed, refresh=False)
-                bar.update(size)
+                bar.update(program.samples_in(done))
             before = now
+    finally:
+        pool.shutdown(cancel_futures=True)
+        bar.close()
+
+
+def _joined(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """The outputs of several parts as one."""
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def _chunk(devices: Mesh) -> int:

@@ -150,13 +150,3 @@ def reduce_compile_time(*, optimise: bool) -> None:
             *["--xla_backend_optimization_level=0"] * (not optimise),
         )
         os.environ.setdefault("XLA_FLAGS", " ".join(flags))
-
-
-def one_device_per_core() -> None:
-    """Makes each CPU core a JAX device, unless XLA_FLAGS is set; call it before any computation.
-
-    Devices compute separate samples in parallel, whereas threads within one operation wait for each
-    other.
-    """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count={cores}")

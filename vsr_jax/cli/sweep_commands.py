@@ -19,7 +19,6 @@ from .common import (
     check_folders,
     command,
     draw_without_display,
-    one_device_per_core,
     positive_integer,
 )
 from .scene_commands import add_scene, model_between, task_of
@@ -69,7 +68,6 @@ def add_sweep(commands: Any) -> None:
 
 
 def _sweep(options: argparse.Namespace) -> int:
-    one_device_per_core()
     task = task_of(options)
     check_folders(options.out, options.plot)
     actuators, dtype = len(task.scene.actuators), task.inputs.dtype

@@ -35,6 +35,7 @@ from jaxtyping import Array
 
 from ..arm.routing import Path, thread_tangent
 from ..arm.scene import CrossSections
+from ..numerics.batching import in_parts
 from ..numerics.component import (
     Forces,
     Matrix,
@@ -55,6 +56,9 @@ from ..numerics.newton import Evaluation, Root, newton
 
 _LOOPED = 3
 """Threads from which on the program loops over them: two are faster side by side."""
+
+_TOGETHER = 1024
+"""Arms without loads that are solved together, at most; larger batches do not fit the caches."""
 
 ALL = tuple(range(6))
 """Indices of all strains."""
@@ -278,7 +282,7 @@ def solve_balance(
         return free_components(sections.rest, free), sections, without_force(tau), *others
 
     root = implicit_root(
-        partial(_find_balance, free),
+        in_parts(partial(_find_balance, free), _TOGETHER),
         imbalance,
         linear_solve,
         at_rest,

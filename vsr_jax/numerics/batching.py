@@ -40,33 +40,73 @@ def side_by_side(solve: Callable, together: int = TOGETHER) -> Callable:
 
     @batched_solve.def_vmap
     def _(size: int, batched: list, *arguments: Any) -> tuple[Any, Any]:
-        parts = -(-size // together) or 1
-        arms = -(-size // parts) or 1
-        arms += 8 if arms % _ALIASED == 0 else 0
-        place = jnp.minimum(jnp.arange(parts * arms), max(size - 1, 0))
-        leaves, tree = jax.tree.flatten(arguments)
-        own = jax.tree.leaves(batched)
+        rows = _rows(size, together)
+        rows += 8 if rows % _ALIASED == 0 else 0
 
-        def part(x: Any) -> Any:
-            x = x if size else jnp.zeros((1, *x.shape[1:]), x.dtype)
-            x = jnp.moveaxis(x[place], 0, -1)
-            return jnp.moveaxis(x.reshape(*x.shape[:-1], parts, arms), -2, 0)
+        def solved(arguments: tuple) -> Any:
+            every = jax.tree.map(
+                lambda x, own: jnp.moveaxis(x, 0, -1) if own else x[..., None],
+                arguments,
+                tuple(batched),
+            )
+            result = solve(*every)
+            return jax.tree.map(
+                lambda x: jnp.moveaxis(jnp.broadcast_to(x, (*x.shape[:-1], rows)), -1, 0), result
+            )
 
-        def solved(varying: list) -> Any:
-            given = iter(varying)
-            every = [next(given) if o else x[..., None] for x, o in zip(leaves, own, strict=True)]
-            result = solve(*jax.tree.unflatten(tree, every))
-            return jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], arms)), result)
-
-        varying = [part(x) for x, o in zip(leaves, own, strict=True) if o]
-        result = lax.map(solved, varying)
-        result = jax.tree.map(
-            lambda x: jnp.moveaxis(x, -1, 1).reshape(parts * arms, *x.shape[1:-1])[:size],
-            result,
-        )
-        return result, jax.tree.map(lambda _: True, result)
+        return _by_parts(solved, arguments, batched, size, rows)
 
     return batched_solve
+
+
+def in_parts(solve: Callable, together: int) -> Callable:
+    """`solve` with a rule for `jax.vmap` that cuts a batch of more than `together` into equal
+    parts, one solved after another, so that the arrays of a part stay in the cache."""
+
+    @custom_vmap
+    def batched_solve(*arguments: Any) -> Any:
+        return solve(*arguments)
+
+    @batched_solve.def_vmap
+    def _(size: int, batched: list, *arguments: Any) -> tuple[Any, Any]:
+        axes = jax.tree.map(lambda own: 0 if own else None, tuple(batched))
+        solved = jax.vmap(solve, axes)
+        if size <= together:
+            return (result := solved(*arguments)), jax.tree.map(lambda _: True, result)
+        rows = _rows(size, together)
+        return _by_parts(lambda part: solved(*part), arguments, batched, size, rows)
+
+    return batched_solve
+
+
+def _rows(size: int, together: int) -> int:
+    """Size of equal parts of a batch, none larger than `together`."""
+    parts = -(-size // together) or 1
+    return -(-size // parts) or 1
+
+
+def _by_parts(
+    solved: Callable, arguments: tuple, batched: list, size: int, rows: int
+) -> tuple[Any, Any]:
+    """Results of a batch whose axis comes first, from those of parts of a number of `rows`, the
+    last one filled with copies of the last arguments, and that all of them are batched."""
+    parts = -(-size // rows) or 1
+    place = jnp.minimum(jnp.arange(parts * rows), max(size - 1, 0))
+    leaves, tree = jax.tree.flatten(arguments)
+    own = jax.tree.leaves(batched)
+
+    def part(x: Any) -> Any:
+        x = x if size else jnp.zeros((1, *x.shape[1:]), x.dtype)
+        return x[place].reshape(parts, rows, *x.shape[1:])
+
+    def one(varying: list) -> Any:
+        given = iter(varying)
+        every = [next(given) if o else x for x, o in zip(leaves, own, strict=True)]
+        return solved(jax.tree.unflatten(tree, every))
+
+    result = lax.map(one, [part(x) for x, o in zip(leaves, own, strict=True) if o])
+    result = jax.tree.map(lambda x: x.reshape(parts * rows, *x.shape[2:])[:size], result)
+    return result, jax.tree.map(lambda _: True, result)
 
 
 def arms_in(tree: Any, axes: int) -> tuple[int, ...]:
