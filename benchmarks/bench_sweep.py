@@ -31,6 +31,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import vsr_jax as vsr
+from vsr_jax.analysis.sweep_program import cores
 from vsr_jax.mechanics.balance import newton_step
 from vsr_jax.studies.timing import Timed, machine, take_turns
 
@@ -159,8 +160,7 @@ def studies() -> dict[str, list[dict[str, Any]]]:
         print(f"\nby {name}")
         found[name] = rates(jobs, 3 if name == "samples" else ROUNDS)
     print("\nby cores")
-    cores = len(os.sched_getaffinity(0))
-    found["cores"] = [row for n in dict.fromkeys((1, cores)) for row in on_cores(n)]
+    found["cores"] = [row for n in dict.fromkeys((1, cores())) for row in on_cores(n)]
     return found
 
 
@@ -227,7 +227,7 @@ def _most_operations(
     def chain(x: jax.Array) -> jax.Array:
         return jax.lax.fori_loop(0, times, body, x)
 
-    x = jnp.linspace(0.9, 1.0, size * len(os.sched_getaffinity(0)))
+    x = jnp.linspace(0.9, 1.0, size * cores())
     job = Timed(jax.jit(chain), x)
     take_turns([job], 9)
     return 2e6 * chains * depth * times * x.size / job.summary()["median_us"]

@@ -97,9 +97,9 @@ class Program:
     other; so there are as many threads as cores. On other devices a second one starts the next part
     while the outputs of the first are copied.
 
-    The batch size is `BATCH_SIZE` on a CPU and the whole chunk on other devices; it is reduced to
-    meet the bound on memory. On a CPU it does not depend on samples, chunk or devices, because
-    rounding may depend on it.
+    The batch size is `BATCH_SIZE` on a CPU and all that a device has of a chunk on others; it is
+    reduced to meet the bound on memory. On a CPU it does not depend on samples, chunk or devices,
+    because rounding may depend on it.
 
     **Arguments:** `task`; `samples`: all samples, NumPy arrays; `chunk`: samples per chunk; `mesh`:
     the devices; `memory`: bound on memory [bytes].
