@@ -23,7 +23,7 @@ from ..numerics.damped_newton import LOAD_INCREMENTS, MAX_TURN, damped_newton
 from ..numerics.damped_rules import HARDENING_STAGES, Damped, Measures
 from ..numerics.implicit import implicit_root
 from ..numerics.newton import Root
-from ..numerics.stacked import once
+from ..numerics.once import once
 from ..typing import cast
 from .arm_balance import ArmImbalance, ArmUnknown, imbalance_of, rounding_of, state_of
 from .arm_tangent import approximate_solve, followed, tangent_solve
@@ -211,9 +211,7 @@ def _solve(
 
 def _uneven(problem: ArmProblem) -> bool:
     """Whether some arms of a batch may need several times as many steps as most."""
-    loads = problem.loads
-    turning = loads is not None and loads.discs is not None and not loads.only_discs
-    return problem.softens or turning
+    return problem.softens or (problem.loads is not None and problem.loads.turns_chords)
 
 
 def _iteration(

@@ -16,11 +16,13 @@ from ..numerics.quadrature import Grid
 from ..typing import cast
 from .arm_balance import ArmImbalance, ArmUnknown
 from .balance import free_components, spread, tangent
-from .coupling import ArmProblem, ArmState, Border, bordered_solve, borders_of, points_of
+from .border import Border, bordered_solve
+from .coupling import ArmProblem, ArmState, borders_of, points_of
 from .elimination import eliminate
 from .elimination_nodes import Definiteness
+from .point_forces import PointForces
 from .pose_elimination import eliminate_poses, motions
-from .reaction import Reaction, Slopes, slopes_of
+from .reaction import Loading, Reaction, Slopes, slopes_of
 from .sizes import node_weight
 from .sliding import sliding_of
 from .springs import Solve, solve_both, with_springs
@@ -61,7 +63,7 @@ def approximate_solve(
     that derivatives by `right` repeat only the former.
     """
     loads = at.loads
-    if loads is None or (loads.around is None and (loads.discs is None or loads.only_discs)):
+    if loads is None or (loads.around is None and not loads.turns_chords):
         unknown, at, right, problem, damping = c.single(
             (unknown, at, right, problem, jnp.asarray(damping))
         )
@@ -75,26 +77,15 @@ def approximate_solve(
     sliding = None if along is None else sliding_of(along, sections.stiffness, flexible, free, grid)
     if along is not None and sliding is not None:
         along = along._replace(touch=sliding.touch)
-    if along is None or loads is None:
-        slopes = pull = None
-    else:
-        slopes, pull = slopes_of(along, loads), along.pull
-        if pull is not None and loads.only_discs:
-            slopes = slopes._replace(ends=pull.cut_slopes(slopes.motion), joined=pull.joined)
-
     points = points_of(problem, unknown.coupled, at)
     if symmetric:
         points = {place: one._replace(wrench=one.direction) for place, one in points.items()}
     pushes = [one.pushes(right.coupled[place]) for place, one in points.items()]
-    if slopes is not None and slopes.contacts is not None:
-        (springs,) = points.values()
-        cells, part = springs.slopes(slopes.contacts)
-        slopes = slopes._replace(cells=cells, part=part)
-
+    slopes = None if along is None or loads is None else _slopes(along, loads, points)
     solve = _elimination(lower, along, slopes, grid, free, flexible)
-    if along is not None and loads is not None and pull is not None:
-        springs = pull.springs(along.rotation, cut=loads.only_discs)
-        solve = with_springs(solve, springs, grid, apart=apart)
+    if along is not None and loads is not None and along.pull is not None:
+        chords = along.pull.springs(along.rotation, cut=loads.only_discs)
+        solve = with_springs(solve, chords, grid, apart=apart)
     b = spread(right.wrench, free)
     if sliding is not None:
         b, more = sliding.driven(b)
@@ -112,6 +103,18 @@ def approximate_solve(
         if sliding is not None:
             strain = sliding.followed(strain, moved)
     return ArmUnknown(strain, tuple(coupled)), negative == 0, doubtful
+
+
+def _slopes(along: Reaction, loads: Loading, points: dict[int, PointForces]) -> Slopes:
+    """Derivatives of the wrenches by motions, with those of the contacts in their cells."""
+    slopes, pull = slopes_of(along, loads), along.pull
+    if pull is not None and loads.only_discs:
+        slopes = slopes._replace(ends=pull.cut_slopes(slopes.motion), joined=pull.joined)
+    if slopes.contacts is None:
+        return slopes
+    (springs,) = points.values()
+    cells, part = springs.slopes(slopes.contacts)
+    return slopes._replace(cells=cells, part=part)
 
 
 def _elimination(

@@ -22,8 +22,9 @@ from ..numerics.quadrature import Grid
 from ..numerics.stacked import stack
 from ..typing import Scalar
 from .balance import largest_force_scale, thread_direction, thread_wrench
+from .border import Border
 from .chords import Pull, discs_of
-from .coupling import ArmProblem, ArmState, Border, Coupling
+from .coupling import ArmProblem, ArmState, Coupling
 from .reaction import Loading, react
 from .sizes import pull_of
 

@@ -45,8 +45,9 @@ from ..numerics.damped_rules import HARDENING_STAGES, SOFT_STAGES
 from ..numerics.quadrature import Grid, locate
 from ..numerics.se3 import base_pose, stacked_rotation
 from ..typing import DTypeLike
-from .coupling import SOFTENED, ArmProblem, ArmState, Coupling, PointForces
+from .coupling import SOFTENED, ArmProblem, ArmState, Coupling
 from .held import of_forces
+from .point_forces import PointForces
 from .pose_terms import finite
 from .reaction import Loading
 from .sizes import softest

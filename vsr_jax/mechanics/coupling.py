@@ -21,26 +21,19 @@ from typing import Any, ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, PyTree
 
 from ..arm.scene import CrossSections, Scene
-from ..numerics import component as c, lu
 from ..numerics.component import Forces, Vector
 from ..numerics.damped_rules import HARDENING_STAGES, SOFT_STAGES
 from ..numerics.quadrature import Grid
-from ..numerics.stacked import once, total
 from .balance import without_force
+from .border import Border, listed
+from .point_forces import PointForces
 from .reaction import Loading, Reaction
-from .slip import Slip
-from .touch import motions_at, received
 
 SOFTENED = (SOFT_STAGES - 0.5) / HARDENING_STAGES
 """Hardness from which constraints have no energy."""
-
-_IDLE = 0.75
-"""Power of the machine epsilon below which a row of the Schur complement is taken to be zero, as of
-a section held in a direction in which the arm cannot move."""
 
 Shares = tuple[Array | None, ...]
 """Share of each thread's force at the nodes; None for 1."""
@@ -141,92 +134,6 @@ class ArmState(NamedTuple):
     loads: Loading | None
     along: Reaction | None
     notes: tuple[Any, ...]
-
-
-class Border(NamedTuple):
-    r"""Part of a coupling with m unknowns in the tangent system.
-
-    - `columns`: P, for each unknown the wrench at the nodes that it adds to the residual: six
-      components, each of shape (m, stages, steps, ...).
-    - `rows`: R, for each row a wrench at the nodes; its work over a change of strain, times the
-      factor, is the change of the row.
-    - `factors`: F, shape (m, ...). `corner`: the diagonal of D, shape (m, ...).
-    """
-
-    columns: Vector
-    rows: Vector
-    factors: Array
-    corner: Array
-
-
-class PointForces(NamedTuple):
-    r"""Part of a coupling whose unknowns are forces at places of the arm, one or more per step, in
-    the tangent system: $\delta x = (s - f \, a^T z) / c$ with the motion z of the arm there, and
-    the wrench w of a unit force, a without friction. Springs of the stiffness $f w a^T / c$ stand
-    for them in the elimination, in place of a border.
-
-    - `wrench`, `direction`: w and a, in the world frame about the node in whose cell they act,
-      shape (6, n, steps, ...).
-    - `cell`: 1 for that node, else 0, shape (stages, n, steps, ...); `part` of the cell before
-      them, shape (n, steps, ...).
-    - `factors`, `corner`: f and c, shape (n, steps, ...).
-    - `handed`: 1 or -1 where the unknown of a step is part of the force of the next or the last
-      one, else 0, shape (n, steps, ...); f is zero and c is 1 for it.
-    - `slip`: friction of the first n / 3 of them, which acts along the others; None without. Rows
-      and unknowns then are pairs: of contact forces (n / 3 * steps, ...) and of friction (3, n / 3
-      * steps, ...). Friction of pairs without `slip` is zero.
-    """
-
-    wrench: Array
-    direction: Array
-    cell: Array
-    part: Array
-    factors: Array
-    corner: Array
-    handed: Array
-    slip: Slip | None = None
-
-    def slopes(self, contacts: Array) -> tuple[Array, Array]:
-        """Derivatives (6, 6, stages, steps, ...) of the wrenches by the motions in the cells, with
-        those of given `contacts` (6, 6, obstacles, steps, ...), and the part of each cell (stages,
-        steps, ...) before them: of several the mean, the stiffest first."""
-        stiffness = once(self.factors) / self.corner
-        square = (stiffness * self.wrench)[:, None] * self.direction
-        for place in range(0, square.shape[2], contacts.shape[2]):
-            here = lax.slice_in_dim(square, place, place + contacts.shape[2], axis=2)
-            contacts = contacts - here
-        cell = self.cell[:, : contacts.shape[2]]
-        stiffness, least = self.cell * stiffness, float(jnp.finfo(stiffness.dtype).tiny)
-        part = total(stiffness * self.part, 1) / (total(stiffness, 1) + least)
-        return total(cell * once(contacts)[:, :, None], 3), part
-
-    def pushes(self, rows: PyTree) -> Array:
-        """Changes (6, stages, steps, ...) of the wrenches by given rows (n * steps, ...) alone."""
-        force = self._listed(rows) / self.corner
-        if self.slip is not None:  # friction on the arm is what its unknown is without the row
-            first, *tangents = jnp.split(self._listed(rows), 3)
-            force = force - jnp.concatenate([jnp.zeros_like(first), *tangents])
-        return total(self.cell * once(force * self.wrench)[:, None], 2)
-
-    def change(self, rows: PyTree, motions: Array) -> PyTree:
-        """Changes of the unknowns for given rows and motions in the cells (6, stages, steps,
-        ...)."""
-        moved = self.factors * total(self.direction * motions_at(self.cell, motions), 0)
-        change = (self._listed(rows) - moved) / self.corner
-        change = change - received(self.handed, change)
-        if self.slip is None:
-            none = isinstance(rows, tuple)
-            return (change.reshape(rows[0].shape), rows[1]) if none else change.reshape(rows.shape)
-        force, first, second = jnp.split(change, 3)
-        friction = self.slip.change(force, first, second, rows[1].reshape(3, *force.shape))
-        return force.reshape(rows[0].shape), friction.reshape(rows[1].shape)
-
-    def _listed(self, rows: PyTree) -> Array:
-        """Rows (n, steps, ...)."""
-        if self.slip is None:
-            return (rows[0] if isinstance(rows, tuple) else rows).reshape(self.corner.shape)
-        along = self.slip.along(rows[1].reshape(self.slip.force.shape))
-        return jnp.concatenate([rows[0].reshape(along.shape[1:]), *along])
 
 
 class Coupling(eqx.Module):
@@ -412,42 +319,3 @@ def points_of(problem: ArmProblem, unknowns: tuple, at: ArmState) -> dict[int, P
         for coupling, x, note in zip(problem.couplings, unknowns, at.notes, strict=True)
     ]
     return {i: points for i, points in enumerate(each) if points is not None}
-
-
-def listed(parts: tuple[Array, ...]) -> Array:
-    """Arrays (m, ...) one after another, the axes behind of the same sizes."""
-    if len(parts) == 1:
-        return parts[0]
-    shape = jnp.broadcast_shapes(*(part.shape[1:] for part in parts))
-    return jnp.concatenate([jnp.broadcast_to(part, (len(part), *shape)) for part in parts])
-
-
-def bordered_solve(
-    strain: Vector, answers: Vector, right: Array, border: Border, grid: Grid
-) -> tuple[Vector, Array, Array]:
-    """Solution of a system with a border: the strain, the unknowns of the couplings, and the number
-    of negative pivots of the Schur complement.
-
-    Each negative pivot is an unstable motion of the arm alone that the couplings prevent: the arm
-    is stable if its tangent has no more negative eigenvalues than that.
-
-    **Arguments:** `strain`, `answers`: solutions of the system of the strains for their right side,
-    and for each of the columns; `right`: that of the couplings, shape (m, ...).
-    """
-
-    def work(rows: Vector, change: Vector) -> Array:
-        return jnp.sum(grid.weight * c.dot(rows, change), axis=(-grid.X.ndim, 1 - grid.X.ndim))
-
-    size = len(border.factors)
-    given = work(border.rows, strain)
-    unit = jnp.eye(size, dtype=right.dtype).reshape(size, size, *(1,) * (right.ndim - 1))
-    pulled = work(tuple(row[:, None] for row in border.rows), answers)
-    schur = unit * border.corner[:, None] - border.factors[:, None] * pulled
-    idle = jnp.max(jnp.abs(schur), axis=1) < jnp.finfo(schur.dtype).eps ** _IDLE
-    factors = lu.factor(schur + jnp.where(idle[:, None], unit, 0.0))
-    x = lu.substitute(factors, right - border.factors * given)
-    strain = tuple(
-        a - jnp.sum(x[:, None, None] * answer, axis=0)
-        for a, answer in zip(strain, answers, strict=True)
-    )
-    return strain, x, jnp.sum(lu.diagonal(factors) < 0, axis=0, dtype=jnp.int32)

@@ -35,8 +35,9 @@ from jaxtyping import Array
 
 from ..numerics import component as c, stacked
 from ..numerics.component import Matrix, Tree, Vector
+from ..numerics.once import once
 from ..numerics.quadrature import Grid, collocation, gauss_legendre, remaining, weighted
-from ..numerics.stacked import columns, matmul, matvec, once, rows, skew, transpose, turned
+from ..numerics.stacked import columns, matmul, matvec, rows, skew, transpose, turned
 from .balance import free_block, free_components, spread
 from .elimination_nodes import (
     UNSTABLE_SECTION,

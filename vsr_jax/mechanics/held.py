@@ -40,7 +40,8 @@ from ..numerics.stacked import (
     turned,
 )
 from ..typing import Scalar
-from .coupling import SOFTENED, ArmProblem, ArmState, Border, Coupling
+from .border import Border
+from .coupling import SOFTENED, ArmProblem, ArmState, Coupling
 from .pose_terms import PoseTerm, base_of, finite
 from .reaction import Loading, Reaction, rotation_at, rotations
 from .sizes import shape_of, softest

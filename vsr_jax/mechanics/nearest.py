@@ -19,8 +19,9 @@ from jaxtyping import Array
 from ..arm.obstacles import Obstacle
 from ..arm.rod import Rod
 from ..numerics.batching import arms_in
+from ..numerics.once import once
 from ..numerics.quadrature import Grid, interpolation, weighted
-from ..numerics.stacked import cross, matvec, once
+from ..numerics.stacked import cross, matvec
 
 _SAMPLES, _ITERATIONS = 5, 8
 """Points of a step from which the nearest one starts, and bound on the Newton steps from it."""

@@ -42,6 +42,7 @@ from jaxtyping import Array
 
 from ..numerics import component as c
 from ..numerics.component import Matrix, Vector
+from ..numerics.once import once
 from ..numerics.quadrature import Grid
 from ..numerics.stacked import (
     affine,
@@ -49,7 +50,6 @@ from ..numerics.stacked import (
     cross,
     matmul,
     matvec,
-    once,
     rows,
     skew,
     stack,

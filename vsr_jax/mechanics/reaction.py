@@ -22,6 +22,7 @@ from jaxtyping import Array
 from ..arm.scene import Scene
 from ..numerics.component import Forces, Vector
 from ..numerics.magnus import magnus_6
+from ..numerics.once import once
 from ..numerics.quadrature import (
     Grid,
     before,
@@ -40,7 +41,6 @@ from ..numerics.stacked import (
     cross,
     matmul,
     matvec,
-    once,
     rows,
     skew,
     stack,
@@ -89,6 +89,11 @@ class Loading(NamedTuple):
         """Whether there are no loads, only straight tendons."""
         dead = self.dead is None and self.follower_density is None
         return dead and not (self.follower_points or self.by_pose or self.around)
+
+    @property
+    def turns_chords(self) -> bool:
+        """Whether loads turn the chords of straight tendons."""
+        return self.discs is not None and not self.only_discs
 
     @property
     def motion(self) -> int:

@@ -11,7 +11,7 @@ from jaxtyping import Array
 from ..numerics import component as c, lu
 from ..numerics.component import Vector
 from ..numerics.quadrature import Grid
-from .coupling import listed
+from .border import listed
 from .elimination_nodes import Definiteness
 
 Solve = Callable[..., tuple[Vector, Definiteness]]

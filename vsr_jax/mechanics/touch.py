@@ -38,8 +38,9 @@ from jaxtyping import Array
 
 from ..arm.obstacles import Obstacle
 from ..arm.rod import Rod
+from ..numerics.once import once
 from ..numerics.quadrature import Grid, gauss_legendre, integral_weights, value_weights
-from ..numerics.stacked import cross, matmul, once, rows, skew, total
+from ..numerics.stacked import cross, matmul, rows, skew, total
 from .nearest import nearest_points
 from .pose_terms import starts_of
 from .slip import Rough, Slip, slip_of

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 from ..typing import Pose, Twist
 from . import component as c, stacked
 from .component import Matrix, Vector
+from .once import once
 
 _TERMS = 12
 """Terms of the series: the first neglected one is below double precision for $\\theta^2 < 4$."""
@@ -87,7 +88,7 @@ def stacked_rotation(k: Array) -> Array:
     (3, 3, ...)."""
     square = stacked.dot(k, k)
     a, b, _ = exp_coefficients(square)
-    a, b = stacked.once(a), stacked.once(b)
+    a, b = once(a), once(b)
     diagonal = (1.0 - b * square) * stacked.identity(k[None])
     return diagonal + a * stacked.skew(k) + (b * k)[:, None] * k[None]
 

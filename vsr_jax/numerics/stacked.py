@@ -11,6 +11,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from .once import once
+
 _FEW = 16
 """Number of terms up to which `total` adds them one by one."""
 
@@ -18,12 +20,6 @@ _FEW = 16
 def stack(components: tuple[Array, ...], axis: int = 0) -> Array:
     """Array of components that broadcast to one shape."""
     return jnp.stack(jnp.broadcast_arrays(*components), axis)
-
-
-def once(x: Array) -> Array:
-    """The same values, computed once: XLA on CPU recomputes sums and products in each of their
-    uses, but never a division."""
-    return x / (1.0 + 0.0 * lax.stop_gradient(x))
 
 
 def rows(x: Array, start: int, end: int) -> Array:
