@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import brentq
+from scipy.spatial.transform import Rotation
 from scipy.special import ellipe, ellipk
 
 import vsr_jax as vsr
@@ -20,9 +21,9 @@ MODEL = vsr.StrainDependent(12)
 BENDING = ("bending_y", "bending_z")
 
 
-def rod(radius=0.005, young=1e6, density=1000.0):
+def rod(radius=0.005, young=1e6, density=1000.0, **more):
     material = vsr.Material(young=young, poisson=0.3, density=density)
-    return vsr.Rod(length=L, section=vsr.Circular(radius=radius), material=material)
+    return vsr.Rod(length=L, section=vsr.Circular(radius=radius), material=material, **more)
 
 
 def stiffness(radius=0.005, young=1e6):
@@ -70,6 +71,54 @@ def test_an_arm_in_a_plane_may_be_held_across_it(free):
     sag = -1e-4 * L**3 / (192 * stiffness())
     np.testing.assert_allclose(eq.position(L / 2)[2], sag, rtol=1e-4)
     np.testing.assert_allclose(eq.supports[0, 5], 5e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("along", [None, (1.0, 0.0, 0.5)])
+def test_an_arm_in_a_plane_is_held_alike_wherever_the_plane_lies(along):
+    """Nothing can move across the plane; no support then pushes there, about no axis in it."""
+    place, turn = np.array([0.7 * L, 0, -0.4 * L]), Rotation.from_rotvec([0, 0.8, 0]).as_matrix()
+
+    def held(turned):
+        base = jnp.eye(4).at[:3, :3].set(turned)
+        way = None if along is None else turned @ jnp.array(along)
+        end = vsr.Held(position=turned @ place, orientation=turned @ turn, along=way)
+        aside = vsr.DistributedWrench(force=turned @ jnp.array([0, 0, 0.05]))
+        arm = rod(base=base)
+        scene = vsr.Scene(arm, loads=aside, held=end, free_strains=("bending_y", "elongation"))
+        eq = vsr.solve(scene, jnp.zeros(0), model=vsr.StrainDependent(8))
+        support = eq.supports[0].reshape(2, 3) @ turned
+        return eq.status, turned.T @ eq.position(0.6 * L), support, eq.stability
+
+    ways = np.concatenate([np.eye(3)[None], Rotation.random(7, random_state=1).as_matrix()])
+    status, middle, support, margin = jax.jit(jax.vmap(held))(jnp.asarray(ways))
+    assert np.all(status == vsr.Status.CONVERGED)
+    np.testing.assert_allclose(middle, np.broadcast_to(middle[0], middle.shape), atol=1e-10 * L)
+    np.testing.assert_allclose(support, np.broadcast_to(support[0], support.shape), atol=2e-8)
+    np.testing.assert_allclose(margin, np.full(8, margin[0]), rtol=1e-6)
+    np.testing.assert_allclose(support[0][[0, 0, 1], [0, 2, 1]], 0, atol=1e-12)
+    assert np.abs(support[0][[0, 1, 1], [1, 0, 2]]).min() > 1e-4
+
+
+def test_a_rigid_piece_may_be_held_twice():
+    """Both supports exert together what the one at its end exerts alone."""
+    arm = rod(rigid=[vsr.RigidPiece(0.12, L)])
+    turn = Rotation.from_rotvec([0, 0.4, 0]).as_matrix()
+
+    def held(*abscissas):
+        places = [np.array([0.17, 0, -0.05]) - (L - X) * turn[:, 0] for X in abscissas]
+        ends = [
+            vsr.Held(X, position=place, orientation=turn)
+            for X, place in zip(abscissas, places, strict=True)
+        ]
+        eq = solved(vsr.Gravity(), held=ends, arm=arm)
+        assert eq.status == vsr.Status.CONVERGED
+        moments = eq.supports[:, :3] + np.cross(places, eq.supports[:, 3:])
+        return eq, np.concatenate([moments.sum(0), eq.supports[:, 3:].sum(0)])
+
+    once, alone = held(L)
+    twice, together = held(L, 0.15)
+    np.testing.assert_allclose(together, alone, rtol=2e-3, atol=1e-12)
+    np.testing.assert_allclose(twice.position(0.1), once.position(0.1), atol=5e-5 * L)
 
 
 def test_a_clamped_elastica_has_the_force_of_the_elliptic_integrals():

@@ -1,4 +1,4 @@
-"""Small dense systems without pivots, against NumPy."""
+"""Small dense systems, against NumPy."""
 
 import jax
 import jax.numpy as jnp
@@ -53,3 +53,21 @@ def test_derivatives_of_any_order_in_both_modes():
             rtol=1e-8,
             atol=1e-10,
         )
+
+
+def test_systems_that_may_be_singular():
+    """Of rank 4 and 2 of 6, neither of them definite, and of full rank; one unknown of three orders
+    of magnitude more than the others."""
+    random = np.random.default_rng(1)
+    factors = random.normal(size=(3, 6, 6))
+    factors[:, :, 0] *= 1e3
+    signs = np.array([1, -1, 1, -1, 1, 1.0]) * [[1, 1, 1, 1, 0, 0], [1, 1, 0, 0, 0, 0], np.ones(6)]
+    matrices = np.einsum("aki,ak,akj->aij", factors, signs, factors)
+    right = np.einsum("aij,aj->ai", matrices, random.normal(size=(3, 6)))
+    x, negative = jax.jit(lu.solve_with_pivots, static_argnums=2)(
+        jnp.moveaxis(matrices, 0, -1), right.T, 1e-11
+    )
+    left = np.einsum("aij,ja->ai", matrices, x) - right
+    np.testing.assert_allclose(left / np.abs(right).max(1, keepdims=True), 0, atol=1e-11)
+    np.testing.assert_array_equal(negative, [2, 1, 2])
+    np.testing.assert_array_equal(np.sum(np.asarray(x) == 0, axis=0), [2, 4, 0])

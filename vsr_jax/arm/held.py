@@ -62,14 +62,15 @@ class Held(Part):
         """Abscissa [m]."""
         return rod.length if self.X is None else self.X
 
-    def directions(self) -> Float[Array, "3 forces"] | None:
-        """Unit vectors of the world in which its position is held; None if it may move."""
+    def directions(self, axes: Float[Array, "3 3"]) -> Float[Array, "3 forces"] | None:
+        """Unit vectors of the world in which its position is held, along `axes` where it can be;
+        None if it may move."""
         if self.position is None:
             return None
         if self.along is None:
-            return jnp.eye(3, dtype=self.position.dtype)
+            return axes
         a = self.along / jnp.sqrt(jnp.sum(self.along**2))
-        first = jnp.cross(a, jnp.eye(3, dtype=a.dtype)[jnp.argmin(jnp.abs(a))])
+        first = jnp.cross(a, axes[:, jnp.argmin(jnp.abs(axes.T @ a))])
         first = first / jnp.sqrt(jnp.sum(first**2))
         return jnp.stack([first, jnp.cross(a, first)], axis=1)
 

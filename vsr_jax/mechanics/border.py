@@ -10,8 +10,8 @@ from ..numerics.component import Vector
 from ..numerics.quadrature import Grid
 
 _IDLE = 0.75
-"""Power of the machine epsilon below which a row of the Schur complement is taken to be zero, as of
-a section held in a direction in which the arm cannot move."""
+"""Power of the machine epsilon below which a pivot of the Schur complement is taken to be rounding,
+as of a section held in a direction in which the arm cannot move, or in one twice."""
 
 
 class Border(NamedTuple):
@@ -59,11 +59,10 @@ def bordered_solve(
     unit = jnp.eye(size, dtype=right.dtype).reshape(size, size, *(1,) * (right.ndim - 1))
     pulled = work(tuple(row[:, None] for row in border.rows), answers)
     schur = unit * border.corner[:, None] - border.factors[:, None] * pulled
-    idle = jnp.max(jnp.abs(schur), axis=1) < jnp.finfo(schur.dtype).eps ** _IDLE
-    factors = lu.factor(schur + jnp.where(idle[:, None], unit, 0.0))
-    x = lu.substitute(factors, right - border.factors * given)
+    rounding = float(jnp.finfo(schur.dtype).eps) ** _IDLE
+    x, negative = lu.solve_with_pivots(schur, right - border.factors * given, rounding)
     strain = tuple(
         a - jnp.sum(x[:, None, None] * answer, axis=0)
         for a, answer in zip(strain, answers, strict=True)
     )
-    return strain, x, jnp.sum(lu.diagonal(factors) < 0, axis=0, dtype=jnp.int32)
+    return strain, x, negative

@@ -1,13 +1,15 @@
 r"""Held sections: constraints on the position and the orientation of cross-sections.
 
-The unknowns are the components of the support reaction, a force F and a moment M in the world frame
-at the section. The rows are
+The unknowns are the components of the support reaction, a force F and a moment M at the section.
+The rows are
 
-$$k \, e_j \cdot (r(X) - p), \quad k_\theta \log(R(X) R_0^T),$$
+$$k \, e_j \cdot (r(X) - p), \quad k_\theta \, e_j \cdot \log(R(X) R_0^T),$$
 
 with the held directions $e_j$ and stiffnesses $k = 3 EI / L^3$ and $k_\theta = 3 EI / L$ that only
-scale them. The work of a unit force or moment over a change of strain is the change of the
-position or rotation, so that rows and columns of the tangent are the same wrenches at the nodes.
+scale them. The work of a unit force or moment over a change of strain is the change of the position
+or rotation, so that rows and columns of the tangent are the same wrenches at the nodes. The
+directions are the axes of the base where they can be: an arm in a plane, wherever it lies, cannot
+move along one of them, and its support does not push there.
 
 On the way to a solution that Newton's method does not find at once, springs with a thousand times
 those stiffnesses stand for the constraints: their energy shows whether a step is an advance.
@@ -52,12 +54,14 @@ _SPRING = 1e3
 
 class Hold(NamedTuple):
     """A held section: its abscissa, the number of steps before it and 1 at the nodes before it; the
-    held directions (3, n) and the position (3,) in which it is held, None if it may move; the
-    orientation (3, 3) in which it is held, None if it may turn; both at rest."""
+    `axes` of moments (3, 3); the held directions (3, n) and the position (3,) in which it is held,
+    None if it may move; the orientation (3, 3) in which it is held, None if it may turn; both at
+    rest."""
 
     X: Array
     step: Array
     before: Array
+    axes: Array
     directions: Array | None
     position: Array | None
     orientation: Array | None
@@ -89,7 +93,7 @@ class Hold(NamedTuple):
         """Moment and force (6, ...) for the unknowns of this section."""
         forces, moments = self.rows
         force = self.force(x)
-        moment = jnp.broadcast_to(x[forces:], force[:3].shape) if moments else force[:3]
+        moment = matvec(self.axes, x[forces:]) if moments else jnp.zeros_like(force[3:])
         return jnp.concatenate([moment, force[3:]])
 
 
@@ -135,7 +139,7 @@ class Holds(Coupling):
                 force = hold.before * hold.force(part)[:, None, None]
                 dead = force if dead is None else dead + force
             if hold.orientation is not None:
-                moment = HoldingMoment(part[forces:], hold.orientation)
+                moment = HoldingMoment(matvec(hold.axes, part[forces:]), hold.orientation)
                 terms.append(PoseTerm(moment, self.rod, jnp.ones_like(scale[0]), *hold[:3]))
             if soft is not None:
                 terms.append(PoseTerm(self._spring(hold, scale), self.rod, soft, *hold[:3]))
@@ -211,7 +215,8 @@ class Holds(Coupling):
             vector = rotation_vector
             for _ in range(axes):
                 vector = jax.vmap(vector, -1, -1)
-            found.append(vector(matmul(R, transpose(hold.orientation))))
+            off = vector(matmul(R, transpose(hold.orientation)))
+            found.append(matvec(transpose(hold.axes), off))
         return found
 
     def _spring(self, hold: Hold, scale: Array) -> "HoldingSpring":
@@ -295,6 +300,7 @@ def holds_of(scene: Scene, sections: CrossSections, grid: Grid) -> Holds | None:
     if not scene.held:
         return None
     base = jnp.asarray(base_pose(scene.rod.base, grid.h.dtype))
+    axes = base[:3, :3]
     rest = stack(tuple(jnp.broadcast_to(x, grid.X.shape) for x in sections.rest))
     starts, R, end = rotations(rows_of(rest, 0, 3), grid.h, scene.rod.base)
     axis = matvec(R, rows_of(rest, 3, 6))
@@ -304,9 +310,8 @@ def holds_of(scene: Scene, sections: CrossSections, grid: Grid) -> Holds | None:
         step, before = before_point(grid, X)
         rotation = rotation_at(starts, end, step)
         place = base[:3, 3] + sum_along(before * axis, grid)[:, 0, 0]
-        return Hold(
-            X, step, before, held.directions(), held.position, held.orientation, place, rotation
-        )
+        ways = held.directions(axes)
+        return Hold(X, step, before, axes, ways, held.position, held.orientation, place, rotation)
 
     holds, length = tuple(map(hold, scene.held)), jnp.sum(grid.h)
     units = [

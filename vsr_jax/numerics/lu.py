@@ -1,13 +1,14 @@
-r"""Small dense systems, $A = L U$ without pivots, in plain array operations.
+r"""Small dense systems, $A = L U$, in plain array operations.
 
 A matrix whose leading minors are positive, as for a stable arm, needs no pivoting; the diagonal of
-U is positive exactly then. The last axes may hold a batch of systems. LAPACK is avoided: two of its
-batched routines in one program can block each other (jaxlib 0.10.2, two cores).
+U is positive exactly then. One that may be singular is solved with pivots. The last axes may hold a
+batch of systems. LAPACK is avoided: two of its batched routines in one program can block each other
+(jaxlib 0.10.2, two cores).
 """
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 
 def factor(matrix: Float[Array, "n n *#arms"]) -> Float[Array, "n n *#arms"]:
@@ -63,3 +64,36 @@ def solve(
     return lax.custom_linear_solve(
         product, right, lambda _, b: substitute(factor(matrix), b), transposed
     )
+
+
+def solve_with_pivots(
+    matrix: Float[Array, "n n *#arms"], right: Float[Array, "n *#arms"], rounding: float
+) -> tuple[Float[Array, "n *#arms"], Int[Array, " *#arms"]]:
+    """Solution of $A x = b$ and the number of negative pivots, those of the diagonal with the
+    greatest first. Where only unknowns are left whose pivots are rounding, they are zero.
+
+    **Arguments:** `rounding`: size of a pivot that is rounding where it was 1 at first or less,
+    and in proportion where it was greater.
+    """
+    place = jnp.arange(len(right)).reshape(-1, *(1,) * (right.ndim - 1))
+    least = rounding * jnp.maximum(jnp.abs(diagonal(matrix)), 1.0)
+
+    def eliminate(_: object, state: tuple[Array, ...]) -> tuple[Array, ...]:
+        A, b, left, negative = state
+        pivots = diagonal(A)
+        beyond = jnp.where(left, jnp.abs(pivots) - least, -jnp.inf)
+        chosen = place == jnp.argmax(beyond, axis=0)
+        sound = jnp.max(beyond, axis=0) > 0
+        chosen &= sound
+        pivot = jnp.where(sound, jnp.sum(jnp.where(chosen, pivots, 0.0), axis=0), 1.0)
+        row = jnp.sum(jnp.where(chosen[:, None], A, 0.0), axis=0) / pivot
+        value = jnp.sum(jnp.where(chosen, b, 0.0), axis=0) / pivot
+        column = jnp.sum(jnp.where(chosen, A, 0.0), axis=1)
+        A = jnp.where(chosen[:, None], row, A - column[:, None] * row)
+        b = jnp.where(chosen, value, b - column * value)
+        return A, b, left & ~chosen, negative + (pivot < 0)
+
+    none = jnp.zeros(right.shape[1:], jnp.int32)
+    start = matrix, right, jnp.ones_like(right, bool), none
+    _, x, left, negative = lax.fori_loop(0, len(right), eliminate, start)
+    return jnp.where(left, 0.0, x), negative

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..arm.scene import CrossSections
 from ..mechanics.arm_balance import ArmUnknown, imbalance_of, state_of
@@ -15,6 +15,7 @@ from ..mechanics.contact import Contacts
 from ..mechanics.coupling import ArmProblem
 from ..mechanics.held import Holds
 from ..numerics import lu
+from ..numerics.component import Vector
 from ..numerics.lanczos import Operator
 from ..numerics.quadrature import Grid
 from ..typing import DTypeLike
@@ -141,27 +142,40 @@ def units_of(
 
 def supported(problem: ArmProblem, unknown: ArmUnknown, free: tuple[int, ...]) -> Supported:
     """The arm of a solution with what holds it."""
-    grid, units = problem.grid, units_of(problem.sections, problem.grid, free)
     at = state_of(unknown.xi, unknown.coupled, problem)
     ties = []
     for coupling, x, note in zip(problem.couplings, unknown.coupled, at.notes, strict=True):
         if isinstance(coupling, Contacts):
             points = coupling.points(x, at, note, problem)
             # friction, of the points behind, does not hold an arm
-            rows = coupling.rows(at, note, grid)
+            rows = coupling.rows(at, note, problem.grid)
             corner = points.corner[: len(coupling.obstacles)].reshape(-1)
         else:
             border = coupling.border(x, at, note, problem)
             if border is None:
                 continue
             rows, corner = border.rows, border.corner
-        rows = jnp.stack(free_components(rows, free), axis=1) * grid.weight * units
-        rows = rows.reshape(len(rows), -1)
-        size = jnp.linalg.norm(jax.lax.stop_gradient(rows), axis=1)
-        holds = (corner < _HOLDING) & (size > 0)
-        ties.append(jnp.where(holds, 1 / jnp.where(holds, size, 1.0), 0.0)[:, None] * rows)
+        ties.append(_ties(rows, corner < _HOLDING, problem, free))
     tied = jnp.concatenate(ties)
+    units = units_of(problem.sections, problem.grid, free)
     return Supported(problem, unknown, units, tied, _shares(tied), free)
+
+
+def _ties(
+    rows: Vector, holds: Bool[Array, " ties"], problem: ArmProblem, free: tuple[int, ...]
+) -> Float[Array, "ties changes"]:
+    """Unit rows over the scaled changes of the free strains, zero for rows that do not hold the
+    arm: also where the free strains have no more than rounding of what all six have, as in the turn
+    about its axis of a straight arm without torsion."""
+
+    def scaled(free: tuple[int, ...]) -> tuple[Array, Array]:
+        units = problem.grid.weight * units_of(problem.sections, problem.grid, free)
+        row = (jnp.stack(free_components(rows, free), axis=1) * units).reshape(len(rows[0]), -1)
+        return row, jnp.linalg.norm(jax.lax.stop_gradient(row), axis=1)
+
+    row, size = scaled(free)
+    holds &= size > jnp.sqrt(jnp.finfo(size.dtype).eps) * scaled(tuple(range(6)))[1]
+    return jnp.where(holds, 1 / jnp.where(holds, size, 1.0), 0.0)[:, None] * row
 
 
 _HOLDING = 0.5
