@@ -149,7 +149,7 @@ class Clearance(Constraint):
     r"""Distance to obstacles: $(g - \lambda / k - d) / L$ with the gap g between an obstacle and
     the outline of the arm.
 
-    Of the obstacles of the scene the gaps are those of `eq.contacts`, on each step. Where the arm
+    Of the obstacles of the scene the gaps are those of `eq.contacts`. Where the arm
     touches them g is nearly zero however hard it presses; the contact force $\lambda$ then says how
     far it is from coming free, with the stiffness $k = 3 EI / L^3$ of the arm as a cantilever. With
     d = 0 the arm may touch, but not press.
@@ -179,8 +179,8 @@ class Clearance(Constraint):
         return ((gaps - self.distance) / arms.scene.rod.length).reshape(-1)
 
 
-def _pressed(arms: Arms) -> Float[Array, "sets obstacles steps"]:
-    """Gaps to the obstacles of the scene on each step [m], negative where the arm presses."""
+def _pressed(arms: Arms) -> Float[Array, "sets obstacles places"]:
+    """Gaps to the obstacles of the scene [m], negative where the arm presses."""
     contacts = _contacts(arms, "Clearance", "in the scene or in Clearance(distance, obstacles)")
     rod = arms.scene.rod
     bending = softest(jax.vmap(rod.stiffness)(_stations(arms)))

@@ -27,7 +27,8 @@ from .functions import Position, function_of_position
 
 class Obstacle(Part):
     r"""A rigid obstacle fixed in the world. One that `encloses` the arm is a lumen: the arm must
-    start inside it, and elsewhere may be beyond its wall at rest.
+    start inside it, and elsewhere may be beyond its wall at rest. One that an arm `lies_along`, as
+    its contacts are seldom in separate places, may be touched by the ends of its steps too.
 
     `friction` is the coefficient $\mu$ [-] of Coulomb friction between arm and obstacle, None
     without. It acts along a path of inputs: see `vsr_jax.follow`.
@@ -36,6 +37,7 @@ class Obstacle(Part):
     friction: Scalar | None = eqx.field(default=None, kw_only=True, metadata={"unit": "-"})
     effect: eqx.AbstractClassVar[str]
     encloses: ClassVar[bool] = False
+    lies_along: ClassVar[bool] = False
 
     @abstractmethod
     def distance(self, point: Position) -> Scalar:
@@ -105,6 +107,7 @@ class Plane(Obstacle):
     normal: Float[Array, "3"] = eqx.field(metadata={"unit": "-"})
     point: Position = eqx.field(metadata={"unit": "m"})
     effect = "plane"
+    lies_along = True
 
     def __init__(
         self,

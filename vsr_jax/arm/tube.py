@@ -49,7 +49,7 @@ class Tube(Obstacle):
     line: Float[Array, "points 3"] | None = eqx.field(metadata={"unit": "m"})
     pose: Pose | None = eqx.field(metadata={"unit": "-"})
     effect = "tube"
-    encloses = True
+    encloses = lies_along = True
 
     def __init__(
         self,

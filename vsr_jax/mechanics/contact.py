@@ -1,7 +1,8 @@
 r"""Contact between an arm and obstacles.
 
-The unknowns are the contact forces $\lambda$ [N], one per obstacle and step of the grid, where the
-gap g to the obstacle is least (see `touch`). The rows are the complementarity of force and gap,
+The unknowns are the contact forces $\lambda$ [N], one or two per obstacle and step of the grid:
+where the gap g to the obstacle is least, and at the end of the step (see `touch`). The rows are the
+complementarity of force and gap,
 
 $$\min(\lambda, k g + c \lambda) = 0,$$
 
@@ -47,6 +48,7 @@ from ..numerics.se3 import base_pose, stacked_rotation
 from ..typing import DTypeLike
 from .coupling import SOFTENED, ArmProblem, ArmState, Coupling
 from .held import of_forces
+from .nearest import lying
 from .point_forces import PointForces
 from .pose_terms import finite
 from .reaction import Loading
@@ -84,9 +86,13 @@ _FLATNESS, _FLATTER = 1e-3, 0.1
 of the outline, and of the length b."""
 
 
+_AT_HELD = 1e-6
+"""Distance of a held section from the end of a step that is at it, as a fraction of the length."""
+
+
 class Contacts(Coupling):
-    """All contacts of an arm; the unknowns are their forces [N], shape (obstacles * steps, ...),
-    and with friction a pair, the second (3, obstacles * steps, ...) the friction [N] in the world.
+    """All contacts of an arm; the unknowns are their forces [N], shape (per_step * steps, ...), and
+    with friction a pair, the second (3, per_step * steps, ...) the friction [N] in the world.
 
     **Fields:** the `obstacles`, the `rod` and the position of its `base`; the stiffness k, `scale`;
     `flatness` and `lift` of `Surroundings`; the length b, `blur`, and the compliance c, `give`, and
@@ -113,6 +119,11 @@ class Contacts(Coupling):
     traces: Traces | None = None
     softens = True
     begins_soft = True
+
+    @property
+    def per_step(self) -> int:
+        """Number of contacts of a step."""
+        return len(self.obstacles) + len(lying(self.obstacles))
 
     def relaxed(self) -> "Contacts":
         obstacles, rod = finite((self.obstacles, self.rod))
@@ -160,7 +171,7 @@ class Contacts(Coupling):
         )
 
     def guess(self, forces: Forces, grid: Grid) -> PyTree:
-        force = jnp.zeros((len(self.obstacles) * self.steps, *grid.h.shape[1:]), grid.h.dtype)
+        force = jnp.zeros((self.per_step * self.steps, *grid.h.shape[1:]), grid.h.dtype)
         return force if self.friction is None else (force, jnp.stack([force] * 3))
 
     def loads(self, x: PyTree, loads: Loading | None) -> Loading | None:
@@ -278,7 +289,7 @@ class Contacts(Coupling):
         step, _ = locate(grid, jnp.mean(X, axis=0))
 
         def gathered(force: Array) -> Array:
-            force = force.reshape(*force.shape[:-1], len(self.obstacles), -1)
+            force = force.reshape(*force.shape[:-1], self.per_step, -1)
             found = jnp.zeros((*force.shape[:-1], self.steps), force.dtype)
             found = found.at[..., step].add(force)
             return found.reshape(*force.shape[:-2], -1)
@@ -366,7 +377,7 @@ def contacts_of(scene: Scene, sections: CrossSections, grid: Grid) -> Contacts |
         base,
         stiffness,
         flatness,
-        jnp.zeros_like(length),
+        _lift(scene, grid),
         _LAST[0] * length,
         jnp.full_like(length, _LAST[1]),
         _first(scene, length),
@@ -377,11 +388,25 @@ def contacts_of(scene: Scene, sections: CrossSections, grid: Grid) -> Contacts |
     )
 
 
+def _lift(scene: Scene, grid: Grid) -> Array:
+    """What is added to the gaps: the end of a step that is held in its place need not touch what it
+    may be held on."""
+    length, ends = jnp.sum(grid.h), lying(scene.obstacles)
+    held = [held.place(scene.rod) for held in scene.held if held.position is not None]
+    if not ends or not held:
+        return jnp.zeros_like(length)
+    apart = jnp.abs(grid.start + grid.h - jnp.stack(held).reshape(-1, 1))
+    there = jnp.any(apart < _AT_HELD * length, axis=0).astype(length.dtype)
+    nearest = jnp.zeros((len(scene.obstacles), len(there)), length.dtype)
+    return 1e3 * length * jnp.concatenate([nearest, jnp.stack([there] * len(ends))])
+
+
 def _friction(obstacles: tuple[Obstacle, ...], dtype: DTypeLike) -> Array | None:
-    """Coefficients of friction; None if no obstacle has any."""
+    """Coefficients of friction of the contacts of a step; None if no obstacle has any."""
     if all(obstacle.friction is None for obstacle in obstacles):
         return None
     each = [0.0 if obstacle.friction is None else obstacle.friction for obstacle in obstacles]
+    each += [each[i] for i in lying(obstacles)]
     return jnp.stack([jnp.asarray(x, dtype) for x in each])
 
 

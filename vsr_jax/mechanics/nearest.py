@@ -57,7 +57,8 @@ def nearest_points(
     axis: Array,
     grid: Grid,
 ) -> Nearest:
-    """The nearest points of all steps to all obstacles.
+    """The nearest points of all steps to all obstacles, and behind them in the axis of obstacles
+    the ends of all steps for those along which an arm can lie.
 
     **Arguments:** `starts`: positions (3, steps, *arms) of the starts of the steps; `axis`: p' (3,
     stages, steps, *arms) at the nodes.
@@ -73,26 +74,20 @@ def nearest_points(
     curvature = jnp.where(inside, curvature, 1.0)
     # its derivative by the shape is that of the root of the slope
     s = once(jnp.clip(s - jnp.where(inside, rate / curvature, 0.0), 0.0, 1.0))
-    place, along, _ = curves.places(s)
-    distance, normal, bend = curves.of_obstacles(_shape, place)
-    outline = curves.outlines(s)
-    gap, slope = distance - outline, lax.stop_gradient(rate)
-    found = Nearest(
-        s,
-        gap,
-        gap + curves.excess(s),
-        outline,
-        normal,
-        place,
-        bend,
-        jnp.concatenate([cross(along, normal), matvec(bend, along)]),
-        jnp.where(inside, -1 / curvature, 0.0),
-        ((s >= 1) & (slope < 0)).astype(s.dtype) - ((s <= 0) & (slope > 0)).astype(s.dtype),
-    )
+    slope, slide = lax.stop_gradient(rate), jnp.where(inside, -1 / curvature, 0.0)
+    nearer = ((s >= 1) & (slope < 0)).astype(s.dtype) - ((s <= 0) & (slope > 0)).astype(s.dtype)
+    given = s, curves.excess(s), slide, nearer
+    kinds, order, given = _with_ends(lying(obstacles), kinds, order, given)
+    found = curves._replace(kinds=kinds).point(*given)
     if order == sorted(order):
         return found
     back = np.argsort(order)
     return jax.tree.map(lambda x: jnp.take(x, back, axis=x.ndim - s.ndim), found)
+
+
+def lying(obstacles: tuple[Obstacle, ...]) -> list[int]:
+    """The places of obstacles that the ends of steps may touch too."""
+    return [i for i, obstacle in enumerate(obstacles) if obstacle.lies_along]
 
 
 class _Kind(eqx.Module):
@@ -128,6 +123,15 @@ class _Curves(NamedTuple):
             best = jnp.where(raised < least, s, best)
             least = jnp.minimum(raised, least)
         return curves, best
+
+    def point(self, s: Array, excess: Array, slide: Array, nearer: Array) -> Nearest:
+        """What is known of points at places in the steps, the rest given."""
+        place, along, _ = self.places(s)
+        distance, normal, bend = self.of_obstacles(_shape, place)
+        outline = self.outlines(s)
+        gap = distance - outline
+        moved = jnp.concatenate([cross(along, normal), matvec(bend, along)])
+        return Nearest(s, gap, gap + excess, outline, normal, place, bend, moved, slide, nearer)
 
     def places(self, s: Array) -> tuple[Array, Array, Array]:
         """Positions (3, ...) at places in the steps, and their first two derivatives."""
@@ -192,6 +196,30 @@ class _Curves(NamedTuple):
         steps, obstacles = -1 - behind, -2 - behind
         function = jax.vmap(function, (None, *(steps for _ in given)), steps)
         return jax.vmap(function, (axis, *(obstacles for _ in given)), obstacles)(of, *given)
+
+
+def _with_ends(
+    ends: list[int], kinds: tuple[_Kind, ...], order: list[int], given: tuple[Array, ...]
+) -> tuple[tuple[_Kind, ...], list[int], tuple[Array, ...]]:
+    """Kinds, their order and numbers (obstacles, steps, *arms) of points, with the ends of steps as
+    further obstacles, behind all others in the order."""
+    first, places, parts, counted = 0, [], [], []
+    for kind in kinds:
+        own, last = order[first : first + kind.count], first + kind.count
+        part = [lax.slice_in_dim(x, first, last) for x in given]
+        places, first = places + own, last
+        if kind.numbers.lies_along:
+            none = jnp.zeros_like(part[0])
+            tip = none + 1.0, none, none, none
+            part = [jnp.concatenate(x) for x in zip(part, tip, strict=True)]
+            twice = jax.tree.map(lambda x: jnp.concatenate([x, x]), kind.numbers)
+            kind, places = (
+                _Kind(twice, 2 * kind.count),
+                places + [len(order) + ends.index(i) for i in own],
+            )
+        parts.append(part)
+        counted.append(kind)
+    return tuple(counted), places, tuple(jnp.concatenate(x) for x in zip(*parts, strict=True))
 
 
 def _distance(obstacle: Obstacle, place: Array) -> tuple[Array]:

@@ -7,9 +7,11 @@ $$\sigma = \arg\min_s \, d(r(s)) - \rho(s) + \epsilon (2 s - 1)^2, \quad 0 \le s
 
 with the distance d to the obstacle and the polynomial r(s) through the step. The small $\epsilon$
 makes it unique where the arm lies along a surface. Contact keeps the gap $d - \rho$ there, without
-the term, from being negative: a step along which the gap changes evenly then passes the surface
-with its end, by $\epsilon / 2$ at most. The springs of the soft stages resist the least value: its
-derivative is that of the gap at a given place, so that they have an energy.
+the term, from being negative. A step along which the gap changes evenly would pass the surface with
+its end, by $\epsilon / 2$ at most: of obstacles that an arm may lie along (`Obstacle.lies_along`)
+the end of each step is a place of contact too. For others two places so near to each other only
+slow the solve down. The springs of the soft stages resist the least value: its derivative is that
+of the gap at a given place, so that they have an energy.
 
 Where the gap has a clear minimum $\epsilon$ vanishes: with the bulge b of the gap over the step,
 its end values on average less the middle one, $\epsilon = \epsilon_0 \exp(-(b / \epsilon_0)^2)$ for
@@ -50,9 +52,9 @@ class Surroundings(NamedTuple):
     r"""The obstacles around an arm.
 
     **Fields:** the `obstacles`, the `rod` and the position of its `base`; `flatness` $\epsilon_0$
-    [m]; `lift` [m], added to all gaps; `stiffness` [N/m] and `width` [m] of penalties; `force` [N]
-    of each obstacle on each step, shape (obstacles * steps, ...); `soft`: None, or 1 where
-    penalties stand for the forces; `rough`: friction, None without.
+    [m]; `lift` [m], added to all gaps alike or to each; `stiffness` [N/m] and `width` [m] of
+    penalties; `force` [N] of each contact, shape (contacts of a step * steps, ...); `soft`: None,
+    or 1 where penalties stand for the forces; `rough`: friction, None without.
     """
 
     obstacles: tuple[Obstacle, ...]
@@ -68,7 +70,8 @@ class Surroundings(NamedTuple):
 
 
 class Touch(NamedTuple):
-    r"""Contact of each obstacle with each step, arrays (..., obstacles, steps, *arms).
+    r"""Contact of each obstacle with each step, arrays (..., obstacles, steps, *arms), where each
+    obstacle may stand twice: also for the ends of the steps (see `nearest_points`).
 
     **Fields:** `gap` [m]; `normal` (3) and `place` (3) of the contact in the world; `sigma`, its
     place in the step; `shares` (stages) of a force there for the nodes of the step; `force` [N];

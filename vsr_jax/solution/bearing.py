@@ -1,11 +1,13 @@
 """What holds an arm and what it touches: support reactions, contacts, and the tangent of an arm
 that they constrain."""
 
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..arm.scene import CrossSections
@@ -14,6 +16,7 @@ from ..mechanics.balance import free_components, spread
 from ..mechanics.contact import Contacts
 from ..mechanics.coupling import ArmProblem
 from ..mechanics.held import Holds
+from ..mechanics.nearest import lying
 from ..numerics import lu
 from ..numerics.component import Vector
 from ..numerics.lanczos import Operator
@@ -22,21 +25,23 @@ from ..typing import DTypeLike
 
 
 class Contact(NamedTuple):
-    """Contact of each obstacle with each step along the arm, where the gap is least.
+    """Contact of each obstacle with each step along the arm, where the gap is least, and in scenes
+    with planes or tubes with the end of each step too (of other obstacles, and where a section is
+    held, the same place once more, without force).
 
-    **Fields:** with the obstacles in the first axis and the steps in the second, the abscissa `X`
-    [m]; `position` [m] of the axis in the world; `normal` of the obstacle; `gap` [m] between the
-    outline and the obstacle; `force` [N] along the normal, nearly 0 where they do not touch;
-    `friction` [N] on the arm, a vector of the world along the surface, zero unless the arm follows
-    a path of inputs (`vsr_jax.follow`).
+    **Fields:** with the obstacles in the first axis and the places, one or two per step, in the
+    second, the abscissa `X` [m]; `position` [m] of the axis in the world; `normal` of the obstacle;
+    `gap` [m] between the outline and the obstacle; `force` [N] along the normal, nearly 0 where
+    they do not touch; `friction` [N] on the arm, a vector of the world along the surface, zero
+    unless the arm follows a path of inputs (`vsr_jax.follow`).
     """
 
-    X: Float[Array, "obstacles steps"]
-    position: Float[Array, "obstacles steps 3"]
-    normal: Float[Array, "obstacles steps 3"]
-    gap: Float[Array, "obstacles steps"]
-    force: Float[Array, "obstacles steps"]
-    friction: Float[Array, "obstacles steps 3"]
+    X: Float[Array, "obstacles places"]
+    position: Float[Array, "obstacles places 3"]
+    normal: Float[Array, "obstacles places 3"]
+    gap: Float[Array, "obstacles places"]
+    force: Float[Array, "obstacles places"]
+    friction: Float[Array, "obstacles places 3"]
 
 
 def no_contact(dtype: DTypeLike) -> Contact:
@@ -53,18 +58,34 @@ def supports_of(problem: ArmProblem, unknown: ArmUnknown) -> Float[Array, "suppo
 
 def contacts_of(problem: ArmProblem, unknown: ArmUnknown) -> Contact:
     """The contacts of an arm with obstacles."""
-    along, grid = state_of(unknown.xi, unknown.coupled, problem).along, problem.grid
-    assert along is not None
-    touch = along.touch
+    at, grid = state_of(unknown.xi, unknown.coupled, problem), problem.grid
+    assert at.along is not None
+    assert at.loads is not None
+    touch, around = at.along.touch, at.loads.around
     assert touch is not None
-    slip = touch.slip
+    assert around is not None
+    friction = jnp.zeros_like(touch.normal) if touch.slip is None else touch.slip.force
+    nearest = len(around.obstacles)
+    twice, ends = range(nearest), lying(around.obstacles)
+    second = np.array([nearest + ends.index(i) if i in ends else i for i in twice])
+    lifted = jnp.broadcast_to(around.lift, touch.gap.shape)[second] > 0
+    alone = lifted | (second < nearest)[:, None]
+
+    def listed(x: Array, *, push: bool = False) -> Array:
+        """Numbers of the contacts of a step (contacts, steps) as (obstacles, places)."""
+        if not ends:
+            return x
+        other = jnp.where(alone, 0.0 if push else x[:nearest], x[second])
+        return jnp.stack([x[:nearest], other], -1).reshape(nearest, -1)
+
+    vectors = jax.vmap(listed, 0, -1)
     return Contact(
-        grid.start + touch.sigma * grid.h,
-        jnp.moveaxis(touch.place, 0, -1),
-        jnp.moveaxis(touch.normal, 0, -1),
-        touch.gap,
-        touch.force,
-        jnp.moveaxis(jnp.zeros_like(touch.normal) if slip is None else slip.force, 0, -1),
+        listed(grid.start + touch.sigma * grid.h),
+        vectors(touch.place),
+        vectors(touch.normal),
+        listed(touch.gap),
+        listed(touch.force, push=True),
+        jax.vmap(partial(listed, push=True), 0, -1)(friction),
     )
 
 
@@ -149,7 +170,7 @@ def supported(problem: ArmProblem, unknown: ArmUnknown, free: tuple[int, ...]) -
             points = coupling.points(x, at, note, problem)
             # friction, of the points behind, does not hold an arm
             rows = coupling.rows(at, note, problem.grid)
-            corner = points.corner[: len(coupling.obstacles)].reshape(-1)
+            corner = points.corner[: coupling.per_step].reshape(-1)
         else:
             border = coupling.border(x, at, note, problem)
             if border is None:
