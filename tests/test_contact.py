@@ -1,24 +1,22 @@
-"""Held sections and contact against closed forms, free bodies and finite differences."""
+"""Contact against closed forms, free bodies and finite differences."""
 
 import re
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.optimize import brentq
-from scipy.spatial.transform import Rotation
-from scipy.special import ellipe, ellipk
 
 import vsr_jax as vsr
 from vsr_jax.arm.rod import STRAINS
 from vsr_jax.files.scene_file import parse_scene, to_toml
+from vsr_jax.mechanics.nearest import lying
 from vsr_jax.mechanics.touch import _handed
 
 L = 0.2
 NO_INPUTS = jnp.zeros(0)
 MODEL = vsr.StrainDependent(12)
-BENDING = ("bending_y", "bending_z")
 
 
 def rod(radius=0.005, young=1e6, density=1000.0, **more):
@@ -33,144 +31,6 @@ def stiffness(radius=0.005, young=1e6):
 def solved(*loads, model=MODEL, start=None, free_strains=STRAINS, arm=None, **around):
     scene = vsr.Scene(arm or rod(), (), loads, free_strains=free_strains, **around)
     return vsr.solve(scene, NO_INPUTS, model=model, start=start)
-
-
-def test_a_propped_cantilever_is_held_by_three_eighths_of_its_load():
-    q = 1e-4
-    prop = vsr.Held(position=(L, 0, 0), along=(1, 0, 0))
-    eq = solved(vsr.DistributedWrench(force=(0, 0, -q)), held=prop, free_strains=BENDING)
-    np.testing.assert_allclose(eq.supports[0], [0, 0, 0, 0, 0, 3 / 8 * q * L], atol=1e-6 * q * L)
-    np.testing.assert_allclose(eq.tip[2, 3], 0, atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    ("orientation", "load"),
-    [(np.eye(3), 4 * np.pi**2), (None, 20.190728556426629)],
-    ids=["clamped", "pinned"],
-)
-def test_the_margin_of_a_held_column_vanishes_at_its_buckling_load(orientation, load):
-    """The pinned end: tan x = x at x^2 = 20.19."""
-    force = 0.5 * load * stiffness() / L**2
-    end = vsr.Held(position=(L, 0, 0), orientation=orientation, along=(1, 0, 0))
-    eq = solved(
-        vsr.TipWrench(force=(-force, 0, 0)),
-        held=end,
-        free_strains=BENDING,
-        model=vsr.StrainDependent(24),
-    )
-    np.testing.assert_allclose(eq.stability, 0.5, atol=1e-7)
-
-
-@pytest.mark.parametrize("free", [("bending_y",), ("bending_y", "elongation")])
-def test_an_arm_in_a_plane_may_be_held_across_it(free):
-    """Clamped at one end, in a slide at the other: it sags by F L^3 / (192 EI) in the middle."""
-    held = vsr.Held(position=(L, 0, 0), orientation=np.eye(3), along=(1, 0, 0))
-    load = vsr.PointWrench(L / 2, force=(0, 0, -1e-4))
-    eq = solved(load, held=held, free_strains=free)
-    assert eq.status == vsr.Status.CONVERGED
-    sag = -1e-4 * L**3 / (192 * stiffness())
-    np.testing.assert_allclose(eq.position(L / 2)[2], sag, rtol=1e-4)
-    np.testing.assert_allclose(eq.supports[0, 5], 5e-5, rtol=1e-4)
-
-
-@pytest.mark.parametrize("along", [None, (1.0, 0.0, 0.5)])
-def test_an_arm_in_a_plane_is_held_alike_wherever_the_plane_lies(along):
-    """Nothing can move across the plane; no support then pushes there, about no axis in it."""
-    place, turn = np.array([0.7 * L, 0, -0.4 * L]), Rotation.from_rotvec([0, 0.8, 0]).as_matrix()
-
-    def held(turned):
-        base = jnp.eye(4).at[:3, :3].set(turned)
-        way = None if along is None else turned @ jnp.array(along)
-        end = vsr.Held(position=turned @ place, orientation=turned @ turn, along=way)
-        aside = vsr.DistributedWrench(force=turned @ jnp.array([0, 0, 0.05]))
-        arm = rod(base=base)
-        scene = vsr.Scene(arm, loads=aside, held=end, free_strains=("bending_y", "elongation"))
-        eq = vsr.solve(scene, jnp.zeros(0), model=vsr.StrainDependent(8))
-        support = eq.supports[0].reshape(2, 3) @ turned
-        return eq.status, turned.T @ eq.position(0.6 * L), support, eq.stability
-
-    ways = np.concatenate([np.eye(3)[None], Rotation.random(7, random_state=1).as_matrix()])
-    status, middle, support, margin = jax.jit(jax.vmap(held))(jnp.asarray(ways))
-    assert np.all(status == vsr.Status.CONVERGED)
-    np.testing.assert_allclose(middle, np.broadcast_to(middle[0], middle.shape), atol=1e-10 * L)
-    np.testing.assert_allclose(support, np.broadcast_to(support[0], support.shape), atol=2e-8)
-    np.testing.assert_allclose(margin, np.full(8, margin[0]), rtol=1e-6)
-    np.testing.assert_allclose(support[0][[0, 0, 1], [0, 2, 1]], 0, atol=1e-12)
-    assert np.abs(support[0][[0, 1, 1], [1, 0, 2]]).min() > 1e-4
-
-
-def test_a_rigid_piece_may_be_held_twice():
-    """Both supports exert together what the one at its end exerts alone."""
-    arm = rod(rigid=[vsr.RigidPiece(0.12, L)])
-    turn = Rotation.from_rotvec([0, 0.4, 0]).as_matrix()
-
-    def held(*abscissas):
-        places = [np.array([0.17, 0, -0.05]) - (L - X) * turn[:, 0] for X in abscissas]
-        ends = [
-            vsr.Held(X, position=place, orientation=turn)
-            for X, place in zip(abscissas, places, strict=True)
-        ]
-        eq = solved(vsr.Gravity(), held=ends, arm=arm)
-        assert eq.status == vsr.Status.CONVERGED
-        moments = eq.supports[:, :3] + np.cross(places, eq.supports[:, 3:])
-        return eq, np.concatenate([moments.sum(0), eq.supports[:, 3:].sum(0)])
-
-    once, alone = held(L)
-    twice, together = held(L, 0.15)
-    np.testing.assert_allclose(together, alone, rtol=2e-3, atol=1e-12)
-    np.testing.assert_allclose(twice.position(0.1), once.position(0.1), atol=5e-5 * L)
-
-
-def test_a_clamped_elastica_has_the_force_of_the_elliptic_integrals():
-    """Both ends clamped, brought to 0.8 L: four quarter waves, 2 E / K - 1 = 0.8 and
-    P = (4 K)^2 EI / L^2."""
-    m = brentq(lambda m: 2 * ellipe(m) / ellipk(m) - 1.8, 1e-6, 0.9)
-    force = (4 * ellipk(m)) ** 2 * stiffness() / L**2
-    end = vsr.Held(position=(0.8 * L, 0, 0), orientation=np.eye(3))
-    aside = vsr.PointWrench(L / 2, force=(0, 0, 0.05 * force))
-    more = {"held": end, "free_strains": BENDING, "model": vsr.StrainDependent(24)}
-    bent = solved(aside, **more)
-    eq = solved(start=bent, **more)
-    np.testing.assert_allclose(eq.supports[0, 3], -force, rtol=1e-6)
-    assert float(eq.position(L / 2)[2]) > 0.2 * L
-
-
-def test_held_sections_have_exact_derivatives():
-    def height(shortened):
-        end = vsr.Held(position=jnp.array([1.0, 0, 0]) * L * (1 - shortened))
-        scene = vsr.Scene(rod(), (), [vsr.TipWrench(moment=(0, 0.01, 0))], held=end)
-        return vsr.solve(scene, NO_INPUTS, model=MODEL).position(L / 2)[2]
-
-    h, at = 1e-5, 0.1
-    difference = (height(at + h) - height(at - h)) / (2 * h)
-    np.testing.assert_allclose(jax.grad(height)(at), difference, rtol=1e-6)
-    forward = jax.jvp(height, (at,), (1.0,))[1]
-    np.testing.assert_allclose(forward, difference, rtol=1e-6)
-
-
-def test_a_clamp_within_the_arm_exerts_the_wrench_that_bends_it_there():
-    """A section of an arm on a turned base is clamped in the pose to which a wrench brings it."""
-    base = vsr.pose((0.01, 0.0, 0.02), pointing=(1.0, 0.2, 0.1))
-    material = vsr.Material(1e6, poisson=0.3, density=1000.0)
-    arm = vsr.Rod(L, vsr.Circular(0.005), material, base=base)
-    force, moment = np.array([0.01, 0.01, 0.02]), np.array([1e-4, -2e-4, 5e-4])
-    bent = solved(vsr.Gravity(), vsr.PointWrench(0.12, force=force, moment=moment), arm=arm)
-    pose = bent.pose(0.12)
-    hold = vsr.Held(0.12, position=pose[:3, 3], orientation=pose)
-    eq = solved(vsr.Gravity(), held=hold, arm=arm)
-    np.testing.assert_allclose(eq.supports[0, 3:], force, atol=1e-5 * 0.02)
-    np.testing.assert_allclose(eq.supports[0, :3], moment, atol=1e-5 * 5e-4)
-    np.testing.assert_allclose(eq.tip, bent.tip, atol=1e-7)
-
-
-def test_the_margin_of_a_held_arm_can_be_differentiated():
-    def margin(push):
-        end = vsr.Held(position=jnp.array([L, 0, 0.0]), along=(1, 0, 0))
-        load = vsr.TipWrench(force=jnp.array([-1.0, 0, 0]) * push)
-        return solved(load, held=end, free_strains=BENDING).stability
-
-    euler = 20.190728556426629 * stiffness() / L**2
-    np.testing.assert_allclose(jax.grad(margin)(0.3 * euler), -1 / euler, rtol=1e-5)
 
 
 SPHERE = vsr.Sphere((0.1, 0.012, -0.03), 0.02)
@@ -307,6 +167,7 @@ def test_contact_has_exact_derivatives_and_batches(pressed):
 def test_a_plane_may_touch_the_ends_of_steps_too(pressed, first):
     floor = vsr.Plane((0, 0, 1), (0, 0, -0.2))
     ball, plane = (1, 0) if first else (0, 1)
+    assert lying((SPHERE, floor, replace(floor, friction=0.1), vsr.Tube(0.1))) == [1, 3]
     eq = solved(PRESS, obstacles=[floor, SPHERE] if first else [SPHERE, floor])
     contacts = eq.contacts
     assert contacts.force.shape == (2, 24)

@@ -86,8 +86,10 @@ def nearest_points(
 
 
 def lying(obstacles: tuple[Obstacle, ...]) -> list[int]:
-    """The places of obstacles that the ends of steps may touch too."""
-    return [i for i, obstacle in enumerate(obstacles) if obstacle.lies_along]
+    """The places of obstacles that the ends of steps may touch too: those without friction, since
+    with it more of the arms that slip along them would be refused."""
+    smooth = [obstacle.friction is None and obstacle.lies_along for obstacle in obstacles]
+    return [i for i, one in enumerate(smooth) if one]
 
 
 class _Kind(eqx.Module):
@@ -208,7 +210,7 @@ def _with_ends(
         own, last = order[first : first + kind.count], first + kind.count
         part = [lax.slice_in_dim(x, first, last) for x in given]
         places, first = places + own, last
-        if kind.numbers.lies_along:
+        if own[0] in ends:
             none = jnp.zeros_like(part[0])
             tip = none + 1.0, none, none, none
             part = [jnp.concatenate(x) for x in zip(part, tip, strict=True)]

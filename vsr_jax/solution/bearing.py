@@ -26,8 +26,8 @@ from ..typing import DTypeLike
 
 class Contact(NamedTuple):
     """Contact of each obstacle with each step along the arm, where the gap is least, and in scenes
-    with planes or tubes with the end of each step too (of other obstacles, and where a section is
-    held, the same place once more, without force).
+    with planes or tubes without friction with the end of each step too (of other obstacles, and
+    where a section is held, the same place once more, without force).
 
     **Fields:** with the obstacles in the first axis and the places, one or two per step, in the
     second, the abscissa `X` [m]; `position` [m] of the axis in the world; `normal` of the obstacle;
