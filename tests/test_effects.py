@@ -49,9 +49,8 @@ def test_follower_loads_alone_carry_the_change_of_the_force():
 
 def test_only_given_lengths_solve_for_tensions(plain):
     driven = operations(vsr.Scene(ARM, [vsr.Tendon(PATH, control="length")]))
-    # the fixed-point steps of the start, the factors of the tensions' system and both
-    # substitutions; no pass along the arm
-    assert driven["scan"] == 4
+    # the fixed-point steps of the start and the elimination of the tensions; no pass along the arm
+    assert driven["scan"] == 2
     assert not any(driven[name] for name in ("sin", "cos", "cumsum", "lu"))
 
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 from scipy.special import ellipe, ellipk
-from test_contact import NO_INPUTS, L, rod, solved, stiffness
+from test_contact import MODEL, NO_INPUTS, L, rod, solved, stiffness
 
 import vsr_jax as vsr
 

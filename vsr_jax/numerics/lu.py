@@ -91,7 +91,7 @@ def solve_with_pivots(
         column = jnp.sum(jnp.where(chosen, A, 0.0), axis=1)
         A = jnp.where(chosen[:, None], row, A - column[:, None] * row)
         b = jnp.where(chosen, value, b - column * value)
-        return A, b, left & ~chosen, negative + (pivot < 0)
+        return A, b, left & ~chosen, negative + (pivot < 0).astype(jnp.int32)
 
     none = jnp.zeros(right.shape[1:], jnp.int32)
     start = matrix, right, jnp.ones_like(right, bool), none
