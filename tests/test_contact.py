@@ -135,6 +135,17 @@ def test_a_solve_may_start_from_the_free_arm(pressed):
     )
 
 
+@pytest.mark.parametrize("round_first", [True, False])
+def test_a_solve_may_start_from_an_arm_among_other_obstacles(round_first):
+    """A plane has another number of contacts than a sphere."""
+    floor = vsr.Plane((0, 0, 1), (0, 0, -0.03))
+    before, here = (SPHERE, floor) if round_first else (floor, SPHERE)
+    cold = solved(PRESS, obstacles=here)
+    warm = solved(PRESS, obstacles=here, start=solved(PRESS, obstacles=before))
+    assert warm.status == vsr.Status.CONVERGED
+    np.testing.assert_allclose(warm.tip, cold.tip, atol=1e-8)
+
+
 def test_the_force_jumps_at_the_contact(pressed):
     contacts = pressed.contacts
     at = int(jnp.argmax(contacts.force[0]))

@@ -167,6 +167,7 @@ class Contacts(Coupling):
         return (
             isinstance(other, Contacts)
             and len(self.obstacles) == len(other.obstacles)
+            and self.per_step == other.per_step
             and (self.friction is None) == (other.friction is None)
         )
 
@@ -406,7 +407,7 @@ def _friction(obstacles: tuple[Obstacle, ...], dtype: DTypeLike) -> Array | None
     if all(obstacle.friction is None for obstacle in obstacles):
         return None
     each = [0.0 if obstacle.friction is None else obstacle.friction for obstacle in obstacles]
-    each += [each[i] for i in lying(obstacles)]
+    each += [0.0] * len(lying(obstacles))
     return jnp.stack([jnp.asarray(x, dtype) for x in each])
 
 
