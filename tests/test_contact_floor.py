@@ -132,16 +132,21 @@ def test_a_low_arm_lifts_off_as_a_beam_of_small_slope():
     np.testing.assert_allclose(moment, weight * free**2 / 6, rtol=2e-3)
 
 
+def soft_arm(density, *, floor=-0.02, held=(), steps=24):
+    """The equilibrium under its weight of an arm clamped at or above a floor."""
+    material = vsr.Material(young=2e5, poisson=0.4, density=density)
+    rod = vsr.Rod(0.2, section=vsr.Circular(0.005), material=material)
+    plane = vsr.Plane([0.0, 0.0, 1.0], [0.0, 0.0, floor])
+    scene = vsr.Scene(rod, loads=vsr.Gravity(), obstacles=plane, held=held)
+    return vsr.solve(scene, jnp.zeros(0), model=vsr.StrainDependent(steps))
+
+
 def test_an_arm_that_lies_along_a_floor_hardly_passes_it():
     """Steps that lie flat touch the floor at their ends too: with their nearest points alone most
     arms passed it by 5e-4 of the radius, and some by 1.4e-3."""
 
     def lowest(density):
-        material = vsr.Material(young=2e5, poisson=0.4, density=density)
-        rod = vsr.Rod(0.2, section=vsr.Circular(0.005), material=material)
-        floor = vsr.Plane([0.0, 0.0, 1.0], [0.0, 0.0, -0.02])
-        scene = vsr.Scene(rod, loads=vsr.Gravity(), obstacles=floor)
-        eq = vsr.solve(scene, jnp.zeros(0), model=vsr.StrainDependent(24))
+        eq = soft_arm(density)
         return jnp.min(eq.position(jnp.linspace(0, 0.2, 401))[:, 2]), eq.status
 
     height, status = jax.jit(jax.vmap(lowest))(jnp.linspace(500.0, 2500.0, 12))
@@ -152,12 +157,8 @@ def test_an_arm_that_lies_along_a_floor_hardly_passes_it():
 
 
 def test_a_section_held_on_a_floor_does_not_touch_it_too():
-    material = vsr.Material(young=2e5, poisson=0.4, density=1000.0)
-    rod = vsr.Rod(0.2, section=vsr.Circular(0.005), material=material)
-    floor = vsr.Plane([0.0, 0.0, 1.0], [0.0, 0.0, -0.005])
     end = vsr.Held(position=[0.2, 0.0, 0.0])
-    scene = vsr.Scene(rod, loads=vsr.Gravity(), obstacles=floor, held=end)
-    eq = vsr.solve(scene, jnp.zeros(0), model=vsr.StrainDependent(12))
+    eq = soft_arm(1000.0, floor=-0.005, held=end, steps=12)
     force, gap = eq.contacts.force[0], eq.contacts.gap[0]
     assert eq.status == vsr.Status.CONVERGED
     assert force[-1] == 0
@@ -173,11 +174,7 @@ def test_an_arm_that_lies_along_a_floor_is_differentiated(density):
     term in epsilon alone. The lighter arm is solved by a second attempt, with a larger one."""
 
     def forces(density):
-        material = vsr.Material(young=2e5, poisson=0.4, density=density)
-        rod = vsr.Rod(0.2, section=vsr.Circular(0.005), material=material)
-        floor = vsr.Plane([0.0, 0.0, 1.0], [0.0, 0.0, -0.02])
-        scene = vsr.Scene(rod, loads=vsr.Gravity(), obstacles=floor)
-        eq = vsr.solve(scene, jnp.zeros(0), model=vsr.StrainDependent(24))
+        eq = soft_arm(density)
         return jnp.sort(eq.contacts.force.reshape(-1))[-11:], eq.status
 
     value, rate = jax.jit(jax.vmap(forces)), jax.jit(jax.jacfwd(lambda x: forces(x)[0]))

@@ -149,10 +149,10 @@ class Clearance(Constraint):
     r"""Distance to obstacles: $(g - \lambda / k - d) / L$ with the gap g between an obstacle and
     the outline of the arm.
 
-    Of the obstacles of the scene the gaps are those of `eq.contacts`. Where the arm
-    touches them g is nearly zero however hard it presses; the contact force $\lambda$ then says how
-    far it is from coming free, with the stiffness $k = 3 EI / L^3$ of the arm as a cantilever. With
-    d = 0 the arm may touch, but not press.
+    Of the obstacles of the scene the gaps are those of `eq.contacts`. Where the arm touches them g
+    is nearly zero however hard it presses; the contact force $\lambda$ then says how far it is from
+    coming free, with the stiffness $k = 3 EI / L^3$ of the arm as a cantilever. With d = 0 the arm
+    may touch, but not press.
 
     Other `obstacles`, which the scene does not have, do not push the arm: where the constraint is
     violated the arm may be inside them. Contact is then not solved: any model will do, and the time

@@ -58,7 +58,7 @@ def nearest_points(
     grid: Grid,
 ) -> Nearest:
     """The nearest points of all steps to all obstacles, and behind them in the axis of obstacles
-    the ends of all steps for those along which an arm can lie.
+    the ends of all steps for those of `lying`.
 
     **Arguments:** `starts`: positions (3, steps, *arms) of the starts of the steps; `axis`: p' (3,
     stages, steps, *arms) at the nodes.
@@ -88,8 +88,7 @@ def nearest_points(
 def lying(obstacles: tuple[Obstacle, ...]) -> list[int]:
     """The places of obstacles that the ends of steps may touch too: those without friction, since
     with it more of the arms that slip along them would be refused."""
-    smooth = [obstacle.friction is None and obstacle.lies_along for obstacle in obstacles]
-    return [i for i, one in enumerate(smooth) if one]
+    return [i for i, one in enumerate(obstacles) if one.lies_along and one.friction is None]
 
 
 class _Kind(eqx.Module):
@@ -215,10 +214,8 @@ def _with_ends(
             tip = none + 1.0, none, none, none
             part = [jnp.concatenate(x) for x in zip(part, tip, strict=True)]
             twice = jax.tree.map(lambda x: jnp.concatenate([x, x]), kind.numbers)
-            kind, places = (
-                _Kind(twice, 2 * kind.count),
-                places + [len(order) + ends.index(i) for i in own],
-            )
+            kind = _Kind(twice, 2 * kind.count)
+            places = places + [len(order) + ends.index(i) for i in own]
         parts.append(part)
         counted.append(kind)
     return tuple(counted), places, tuple(jnp.concatenate(x) for x in zip(*parts, strict=True))

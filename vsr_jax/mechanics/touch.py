@@ -8,8 +8,8 @@ $$\sigma = \arg\min_s \, d(r(s)) - \rho(s) + \epsilon (2 s - 1)^2, \quad 0 \le s
 with the distance d to the obstacle and the polynomial r(s) through the step. The small $\epsilon$
 makes it unique where the arm lies along a surface. Contact keeps the gap $d - \rho$ there, without
 the term, from being negative. A step along which the gap changes evenly would pass the surface with
-its end, by $\epsilon / 2$ at most: of obstacles that an arm may lie along (`Obstacle.lies_along`)
-the end of each step is a place of contact too. For others two places so near to each other only
+its end, by $\epsilon / 2$ at most: of obstacles that an arm may lie along (`lying`) the
+end of each step is a place of contact too. For others two places so near to each other only
 slow the solve down. The springs of the soft stages resist the least value: its derivative is that
 of the gap at a given place, so that they have an energy.
 

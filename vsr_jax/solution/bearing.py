@@ -1,22 +1,23 @@
 """What holds an arm and what it touches: support reactions, contacts, and the tangent of an arm
 that they constrain."""
 
-from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ..arm.scene import CrossSections
 from ..mechanics.arm_balance import ArmUnknown, imbalance_of, state_of
-from ..mechanics.balance import free_components, spread
+from ..mechanics.balance import ALL, free_components, spread
 from ..mechanics.contact import Contacts
 from ..mechanics.coupling import ArmProblem
 from ..mechanics.held import Holds
 from ..mechanics.nearest import lying
+from ..mechanics.touch import Surroundings, Touch
 from ..numerics import lu
 from ..numerics.component import Vector
 from ..numerics.lanczos import Operator
@@ -65,28 +66,39 @@ def contacts_of(problem: ArmProblem, unknown: ArmUnknown) -> Contact:
     assert touch is not None
     assert around is not None
     friction = jnp.zeros_like(touch.normal) if touch.slip is None else touch.slip.force
-    nearest = len(around.obstacles)
-    twice, ends = range(nearest), lying(around.obstacles)
-    second = np.array([nearest + ends.index(i) if i in ends else i for i in twice])
-    lifted = jnp.broadcast_to(around.lift, touch.gap.shape)[second] > 0
-    alone = lifted | (second < nearest)[:, None]
+    which, pushes = _places(touch, around)
+    steps = jnp.arange(len(grid.h))[:, None]
 
-    def listed(x: Array, *, push: bool = False) -> Array:
-        """Numbers of the contacts of a step (contacts, steps) as (obstacles, places)."""
-        if not ends:
-            return x
-        other = jnp.where(alone, 0.0 if push else x[:nearest], x[second])
-        return jnp.stack([x[:nearest], other], -1).reshape(nearest, -1)
+    def listed(x: Array) -> Array:
+        """Numbers (..., contacts of a step, steps) as (..., obstacles, places)."""
+        return x[..., which, steps].reshape(*x.shape[:-2], len(around.obstacles), -1)
 
-    vectors = jax.vmap(listed, 0, -1)
+    def vectors(x: Array) -> Array:
+        return jnp.moveaxis(listed(x), 0, -1)
+
     return Contact(
         listed(grid.start + touch.sigma * grid.h),
         vectors(touch.place),
         vectors(touch.normal),
         listed(touch.gap),
-        listed(touch.force, push=True),
-        jax.vmap(partial(listed, push=True), 0, -1)(friction),
+        jnp.where(pushes, listed(touch.force), 0.0),
+        jnp.where(pushes[..., None], vectors(friction), 0.0),
     )
+
+
+def _places(touch: Touch, around: Surroundings) -> tuple[Array, Array]:
+    """The contacts of a step at its places (obstacles, steps, 1 or 2), and whether their forces are
+    those of the places (obstacles, places): an obstacle without a contact at the end of a step has
+    the nearest one twice."""
+    count, ends = len(around.obstacles), lying(around.obstacles)
+    first = jnp.broadcast_to(jnp.arange(count)[:, None], (count, touch.gap.shape[1]))
+    if not ends:
+        return first[..., None], jnp.ones_like(first, bool)
+    second = np.array([count + ends.index(i) if i in ends else i for i in range(count)])
+    lifted = jnp.broadcast_to(around.lift, touch.gap.shape)[second] > 0
+    there = ~lifted & (second >= count)[:, None]
+    which = jnp.stack([first, jnp.where(there, second[:, None], first)], -1)
+    return which, jnp.stack([jnp.ones_like(there), there], -1).reshape(count, -1)
 
 
 class Supported(eqx.Module):
@@ -163,6 +175,7 @@ def units_of(
 
 def supported(problem: ArmProblem, unknown: ArmUnknown, free: tuple[int, ...]) -> Supported:
     """The arm of a solution with what holds it."""
+    units = units_of(problem.sections, problem.grid, ALL)
     at = state_of(unknown.xi, unknown.coupled, problem)
     ties = []
     for coupling, x, note in zip(problem.couplings, unknown.coupled, at.notes, strict=True):
@@ -176,26 +189,23 @@ def supported(problem: ArmProblem, unknown: ArmUnknown, free: tuple[int, ...]) -
             if border is None:
                 continue
             rows, corner = border.rows, border.corner
-        ties.append(_ties(rows, corner < _HOLDING, problem, free))
+        ties.append(_ties(rows, corner < _HOLDING, problem.grid.weight * units, free))
     tied = jnp.concatenate(ties)
-    units = units_of(problem.sections, problem.grid, free)
-    return Supported(problem, unknown, units, tied, _shares(tied), free)
+    return Supported(problem, unknown, units[np.asarray(free)], tied, _shares(tied), free)
 
 
 def _ties(
-    rows: Vector, holds: Bool[Array, " ties"], problem: ArmProblem, free: tuple[int, ...]
+    rows: Vector, holds: Bool[Array, " ties"], scale: Array, free: tuple[int, ...]
 ) -> Float[Array, "ties changes"]:
     """Unit rows over the scaled changes of the free strains, zero for rows that do not hold the
     arm: also where the free strains have no more than rounding of what all six have, as in the turn
     about its axis of a straight arm without torsion."""
-
-    def scaled(free: tuple[int, ...]) -> tuple[Array, Array]:
-        units = problem.grid.weight * units_of(problem.sections, problem.grid, free)
-        row = (jnp.stack(free_components(rows, free), axis=1) * units).reshape(len(rows[0]), -1)
-        return row, jnp.linalg.norm(jax.lax.stop_gradient(row), axis=1)
-
-    row, size = scaled(free)
-    holds &= size > jnp.sqrt(jnp.finfo(size.dtype).eps) * scaled(tuple(range(6)))[1]
+    every = jnp.stack(rows, axis=1) * scale
+    row = every[:, np.asarray(free)].reshape(len(every), -1)
+    size, whole = (
+        jnp.linalg.norm(lax.stop_gradient(x).reshape(len(x), -1), axis=1) for x in (row, every)
+    )
+    holds &= size > jnp.sqrt(jnp.finfo(size.dtype).eps) * whole
     return jnp.where(holds, 1 / jnp.where(holds, size, 1.0), 0.0)[:, None] * row
 
 
