@@ -17,7 +17,7 @@ from ..numerics.quadrature import Grid
 from ..numerics.stacked import components
 from .balance import free_components, residual
 from .cable import lengths_of
-from .contact import contacts_of
+from .contact_scales import contacts_of
 from .coupling import ArmProblem, ArmState, Carried, Coupling, Shares, forces_at, loads_with
 from .friction import friction_of
 from .held import holds_of
