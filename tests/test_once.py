@@ -31,6 +31,14 @@ def test_values_and_derivatives_are_those_without_it(shape, dtype):
     assert once(x).dtype == dtype
 
 
+def test_truth_values_stay():
+    x = jnp.asarray([True, False, True])
+    for run in (once, jax.jit(once), jax.vmap(once)):
+        np.testing.assert_array_equal(run(x), x)
+    assert once(x).dtype == bool
+    assert bool(jax.jit(once)(jnp.asarray(True)))
+
+
 @pytest.mark.parametrize("axis", [0, 1])
 def test_a_batch_in_any_axis(axis):
     x = jnp.arange(6.0).reshape(2, 3)

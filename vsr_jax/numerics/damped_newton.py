@@ -14,6 +14,7 @@ from .batching import Iteration
 from .component import select
 from .damped_rules import SOFT_STAGES, Damped, Guard, Measures
 from .newton import Root
+from .once import once
 
 MAX_DAMPED_STEPS, MAX_STAGED_STEPS = 200, 300
 """Bound on the evaluations of `damped_newton`, and that where there are stages; heavy soft arms
@@ -161,6 +162,7 @@ def damped_newton(
         if stages:
             steep = ~(probe | plain | hard | slow) & rules.steep(old, taken, increments)
             cut = steep if slid is None else slid | steep
+        taken, cut = once(taken), None if cut is None else once(cut)
         guard, more, last = rules.judged(
             old, new, left, taken, plain | hard, damping, applied, floor, accepted, small
         )
@@ -169,7 +171,7 @@ def damped_newton(
             less, shorter = rules.shorter(old, steep)
             guard = select(cut, less, guard._replace(cuts=jnp.zeros_like(old.cuts)))
         guard = guard._replace(plain=old.plain + plain.astype(jnp.int32))
-        more = jnp.where(probe, 1.0, jnp.where(hard, 0.0, more))
+        last, more = once(last), once(jnp.where(probe, 1.0, jnp.where(hard, 0.0, more)))
         new_step = jax.tree.map(lambda s, last: s + more.astype(s.dtype) * last, new.step, step)
         if stages and measures.dot is not None:
             back = measures.dot(new_step, step) < -0.5 * measures.dot(step, step)
@@ -177,7 +179,7 @@ def damped_newton(
             new_step = jax.tree.map(lambda s: half.astype(s.dtype) * s, new_step)
         if measures.dot is not None:
             tail = ~probe & (turn < _TAIL) & (new.size > small)
-            linear = tail & rules.linear(old, guard)
+            linear = once(tail & rules.linear(old, guard))
             near = accelerated(new.step, step, earlier, linear & (old.whole > 0), measures.dot)
             new_step = select(linear, near, new_step)
             guard = guard._replace(rate=rules.slowest(old, guard, linear))
@@ -186,7 +188,7 @@ def damped_newton(
             part = jax.tree.map(lambda s: jnp.asarray(shorter, s.dtype) * s, step)
             new_step = select(cut, part, new_step)
         pull = jnp.where(taken, measures.work(new.residual, new_step), guard.pull)
-        go = going(old)
+        go = once(going(old))
         ratio = measures.turn(new_step) / turn
         guard = select(go, guard._replace(pull=pull), rules.probed(old, probe, ratio))
         finished = jax.tree.map(
@@ -205,7 +207,7 @@ def damped_newton(
             if not twice:
                 sound = guard.definite & (guard.merit <= accepted)
                 failed = (ended & ~sound) | (guard.spent >= _FIRST_STAGES)
-        again = ~old.gradual & failed
+        again = once(~old.gradual & failed)
         guard = select(again, second._replace(spent=guard.spent), guard)
         new_step = jax.tree.map(lambda s: jnp.where(again, 0.0, s).astype(s.dtype), new_step)
         return select(again, origin, x), new_step, earlier, guard

@@ -14,9 +14,9 @@ from jaxtyping import Array
 
 
 def once(x: Array) -> Array:
-    """The same values, computed once; of floats only. Derivatives of both modes are computed once
-    too."""
-    return _once.bind(x)
+    """The same values, computed once; of floats and of truth values. Derivatives of both modes are
+    computed once too."""
+    return _once.bind(x.astype(jnp.float32)) > 0 if x.dtype == bool else _once.bind(x)
 
 
 def _divided(x: Array) -> Array:
