@@ -127,3 +127,13 @@ def test_errors_of_a_quick_program_are_its_own():
 
     with pytest.raises(ValueError, match="need none"):
         refuses(jnp.zeros(()))
+
+
+def test_quick_options_are_taken_and_leave_what_a_user_has_set(monkeypatch):
+    options, level = vsr.quick_compilation, "xla_backend_optimization_level"
+    assert jax.jit(lambda x: x + 1, compiler_options=options())(1.0) == 2.0
+    for flags, expected in ((f"--{level}=0", False), ("", jax.default_backend() == "cpu")):
+        monkeypatch.setenv("XLA_FLAGS", flags)
+        options.cache_clear()
+        assert (level in options()) == expected
+    options.cache_clear()

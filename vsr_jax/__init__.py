@@ -108,7 +108,7 @@ if TYPE_CHECKING:
         stiffness_matrix,
     )
     from .models.continuum import Continuum
-    from .numerics import se3, step_twist, zanna_step
+    from .numerics import quick_compilation, se3, step_twist, zanna_step
     from .optimization import objective
     from .optimization.design_search import Design, design
     from .optimization.search import Search
@@ -240,6 +240,7 @@ __all__ = [
     "plot_design",
     "plot_fit",
     "pose",
+    "quick_compilation",
     "reach",
     "save",
     "se3",

@@ -17,6 +17,7 @@ from ..arm.scene import Scene
 from ..arm.scene_numbers import parameters, replaced
 from ..mechanics.balance import free_block, tangent
 from ..numerics import component as c
+from ..numerics.compiling import quick_jit
 from ..numerics.se3 import skew, unskew
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
@@ -87,7 +88,7 @@ def sensitivity(eq: Equilibrium) -> Sensitivity:
     )
 
 
-@eqx.filter_jit
+@quick_jit
 def _by_numbers(eq: Equilibrium) -> tuple[Array, Array, Array]:
     numbers = {name: parameter.value for name, parameter in parameters(eq.scene).items()}
 
@@ -120,7 +121,7 @@ def tip_jacobian(eq: Equilibrium) -> Float[Array, "6 inputs"]:
     return _by_inputs(eq)
 
 
-@eqx.filter_jit
+@quick_jit
 def _by_inputs(eq: Equilibrium) -> Array:
     def motion(inputs: Array) -> Array:
         found = solve(eq.scene, inputs, model=eq.model, start=_near(eq))
@@ -144,7 +145,7 @@ def compliance(eq: Equilibrium) -> Float[Array, "6 6"]:
     return _compliance(eq)
 
 
-@eqx.filter_jit
+@quick_jit
 def _compliance(eq: Equilibrium) -> Array:
     if eq.scene.coupled or not eq.model.balanced_everywhere:
         found = jax.jacfwd(lambda wrench: _motion(_pushed(eq, wrench).tip, eq.tip))(

@@ -19,7 +19,6 @@ considerations on transmission characteristics for tendon drive robots, ICAR 199
 
 from collections.abc import Sequence
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -29,6 +28,7 @@ from jaxtyping import Array
 from ..arm.scene import Scene
 from ..models.base import Near, Outcome, Status
 from ..models.strain_dependent import StrainDependent
+from ..numerics.compiling import quick_jit
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import checked_outcome, near_of
 from ..typing import cast
@@ -103,7 +103,7 @@ def _start(start: Equilibrium, scene: Scene, model: StrainDependent) -> Near:
     return near._replace(scene=scene)
 
 
-@eqx.filter_jit
+@quick_jit
 def _follow(scene: Scene, before: Near, inputs: Array) -> Outcome:
     model = before.model
     assert isinstance(model, StrainDependent)

@@ -20,6 +20,7 @@ from ..arm.scene import Scene
 from ..files.output import plain
 from ..mechanics.balance import free_components, thread_direction, thread_wrench
 from ..models.base import Model, Status
+from ..numerics.compiling import quick_jit
 from ..numerics.component import norm, scale, split, times
 from ..numerics.quadrature import make_grid
 from ..solution.equilibrium import Equilibrium
@@ -214,7 +215,7 @@ def check(scene: Scene, inputs: ArrayLike | Sequence, *, model: Model | None = N
     return _check(solve(scene, inputs, model=model))
 
 
-@eqx.filter_jit
+@quick_jit
 def _check(eq: Equilibrium) -> Health:
     scene, inputs, model = eq.scene, eq.inputs, eq.model
     finer = solve(scene, inputs, model=model.finer())

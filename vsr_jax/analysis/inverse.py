@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float
 from ..arm.scene import Scene
 from ..models.base import Model
 from ..numerics import bounded_least_squares
+from ..numerics.compiling import quick_jit
 from ..numerics.component import norm, split
 from ..numerics.se3 import rotation_vector
 from ..solution.equilibrium import Equilibrium
@@ -256,7 +257,7 @@ def _check_start(start: Reach, low: Array) -> Reach:
     return start
 
 
-@eqx.filter_jit
+@quick_jit
 def _reach(problem: _ReachProblem, allowed: Scalar) -> Reach:
     compiling()
     still = _still(problem)

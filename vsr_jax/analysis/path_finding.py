@@ -28,6 +28,7 @@ from jaxtyping import Array, Bool, Float
 from ..arm.scene import Scene
 from ..models.base import Model
 from ..numerics import bounded_least_squares
+from ..numerics.compiling import quick_jit
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
 from ..typing import Scalar, VectorLike, cast
@@ -185,7 +186,7 @@ class _PathProblem(NamedTuple):
         return shortfall(self.margins(self.at(share))).reshape(-1)
 
 
-@eqx.filter_jit
+@quick_jit
 def _find_path(problem: _PathProblem) -> InputPath:
     compiling()
     arrays, others = eqx.partition(problem, eqx.is_inexact_array)

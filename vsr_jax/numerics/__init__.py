@@ -5,6 +5,7 @@ Independent of rods, threads and loads: everything here takes arrays and functio
 """
 
 from . import se3
+from .compiling import quick_compilation
 from .magnus import step_twist, zanna_step
 
-__all__ = ["se3", "step_twist", "zanna_step"]
+__all__ = ["quick_compilation", "se3", "step_twist", "zanna_step"]

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -17,6 +16,7 @@ from ..mechanics.coupling import ArmProblem
 from ..mechanics.reaction import react_at
 from ..models.base import Model, Nodes, Outcome, Status
 from ..numerics import component as c
+from ..numerics.compiling import quick_jit
 from ..numerics.component import Vector
 from ..typing import Pose, Scalar, VectorLike
 from ..validation import is_traced, on_arm
@@ -291,7 +291,7 @@ class Equilibrium(Solved):
         start, end = actuator.start, actuator.end
         return 0.0 if start is None else start, self.scene.rod.length if end is None else end
 
-    @eqx.filter_jit
+    @quick_jit
     def _thread(self, index: int, X: Array) -> Array:
         actuator = self.scene.actuators[index]
 

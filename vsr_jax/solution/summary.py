@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..arm.discs import on_chords, points_at
+from ..numerics.compiling import quick_jit
 from ..typing import VectorLike
 from ..validation import choice
 from .quantities import QUANTITIES, AlongArm, Quantity, Solved, abscissas
@@ -84,7 +85,7 @@ def compiled_summary(eq: Solved, X: VectorLike) -> Callable[[Solved], Summary]:
     return lambda eq: program(eq, at, ())
 
 
-@eqx.filter_jit
+@quick_jit
 def _values(eq: Solved, names: tuple[str, ...]) -> dict[str, Any]:
     return {name: eq.value(name) for name in names}
 
