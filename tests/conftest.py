@@ -33,6 +33,7 @@ import numpy as np
 import pytest
 
 jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_traceback_in_locations_limit", 0)  # nobody reads them, and they take time
 
 # Traced programs are millions of small objects that stay: looking for garbage among them at
 # Python's usual pace takes a tenth of the time, and more the longer a process runs.
@@ -61,6 +62,12 @@ def central_differences(function, size):
         ) / 12
 
     return np.stack([change(unit) for unit in np.eye(size)])
+
+
+def with_derivative(function):
+    """A function of an array, and its derivative by forward mode, as one program: it is compiled
+    once for both, also where only its values are asked for."""
+    return jax.jit(lambda x: jax.jacfwd(lambda x: (function(x),) * 2, has_aux=True)(x)[::-1])
 
 
 @pytest.fixture(params=["float32", "float64"])

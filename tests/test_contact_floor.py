@@ -175,13 +175,13 @@ def test_an_arm_that_lies_along_a_floor_is_differentiated(density):
 
     def forces(density):
         eq = soft_arm(density)
-        return jnp.sort(eq.contacts.force.reshape(-1))[-11:], eq.status
+        found = jnp.sort(eq.contacts.force.reshape(-1))[-11:]
+        return found, (found, eq.status)
 
-    value, rate = jax.jit(jax.vmap(forces)), jax.jit(jax.jacfwd(lambda x: forces(x)[0]))
     step = 1e-3 * density
-    found, status = value(density + step * jnp.array([-2.0, -1.0, 1.0, 2.0]))
+    at = density + step * jnp.array([-2.0, -1.0, 0.0, 1.0, 2.0])
+    rate, (found, status) = jax.jit(jax.vmap(jax.jacfwd(forces, has_aux=True)))(at)
     assert np.all(status == vsr.Status.CONVERGED)
     assert np.all(found > 0)
-    expected = (found[0] - found[3] + 8 * (found[2] - found[1])) / (12 * step)
-    exact = rate(density)
-    assert np.max(np.abs(exact - expected)) < 1e-6 * np.max(np.abs(expected))
+    expected = (found[0] - found[4] + 8 * (found[3] - found[1])) / (12 * step)
+    assert np.max(np.abs(rate[2] - expected)) < 1e-6 * np.max(np.abs(expected))

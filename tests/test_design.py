@@ -107,12 +107,12 @@ def test_gradients_of_objectives_against_differences(scene, tips, name):
     """With respect to radius, angle and all inputs."""
     free = {"actuators[*].routing.radius": (0.002, 0.009), "inputs": (0.1, 5.0)}
     _, terms, given = formulate(scene, free, OBJECTIVES[name](tips), SETS, (), {}, MODEL)
-    value = jax.jit(lambda free: terms(free)[0])
-    slope = jax.jit(jax.grad(lambda free: terms(free)[0]))(given)
+    found = jax.jit(jax.value_and_grad(lambda free: terms(free)[0]))
+    slope = found(given)[1]
     for key, place in (("actuators[0].routing.radius", ()), ("inputs", (1, 0)), ("inputs", (2, 1))):
         step = 1e-4 * float(given[key][place])
         ahead, behind = (
-            float(value(given | {key: given[key].at[place].add(d)})) for d in (step, -step)
+            float(found(given | {key: given[key].at[place].add(d)})[0]) for d in (step, -step)
         )
         scale = max(
             abs(float(x))

@@ -160,9 +160,9 @@ def answer(scene, forces, unit, second):
         return tip @ jnp.array([0.3, 0.5, 0.8], tip.dtype), (tip, eq.status, eq.stability)
 
     still = jnp.zeros_like(forces)
-    value, (tip, status, margin) = solved(still)
+    (value, (tip, status, margin)), gradient = jax.value_and_grad(solved, has_aux=True)(still)
     hessian = jax.hessian(solved, has_aux=True)(still)[0] if second else jnp.full((2, 2), jnp.nan)
-    return Answer(tip, status, margin, value, jax.grad(solved, has_aux=True)(still)[0], hessian)
+    return Answer(tip, status, margin, value, gradient, hessian)
 
 
 def solved(case, dtype, offset=(0.0, 0.0), *, second=True):
