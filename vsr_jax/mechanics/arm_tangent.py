@@ -12,6 +12,7 @@ from jaxtyping import Array, PyTree
 
 from ..numerics import component as c
 from ..numerics.component import Matrix, Vector
+from ..numerics.once import once
 from ..numerics.quadrature import Grid
 from ..typing import cast
 from .arm_balance import ArmImbalance, ArmUnknown
@@ -237,6 +238,7 @@ def followed(
     late = [i for i, one in enumerate(problem.couplings) if one.follows_rate]
     if not late:
         return step
+    step = jax.tree.map(once, step)
     coupled = list(step.coupled)
     for i in late:
         coupled[i] = jax.tree.map(jnp.zeros_like, coupled[i])

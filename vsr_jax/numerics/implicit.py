@@ -12,6 +12,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
 
 from .newton import Root
+from .once import once
 
 
 def implicit_root(
@@ -48,7 +49,7 @@ def implicit_root(
     @partial(root.defjvp, symbolic_zeros=True)
     def _(primals: tuple, tangents: tuple) -> tuple[Root, Root]:
         found = root(*primals)
-        sound = found.converged & found.definite
+        sound = once(found.converged & found.definite)
         rest_x, *rest = at_rest(found.x, *primals)
         replaced = jax.tree.map(lambda p, p_rest: p is not p_rest, primals, tuple(rest))
         x = jax.tree.map(partial(jnp.where, sound), found.x, rest_x)

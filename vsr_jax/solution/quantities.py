@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float
 from ..arm.scene import Scene
 from ..models.base import Status
 from ..numerics.compiling import quick_jit
+from ..numerics.once import once
 from ..numerics.quadrature import onto
 from ..typing import VectorLike
 from ..validation import ROUNDING, choice, on_arm
@@ -52,7 +53,8 @@ class Solved(eqx.Module):
 
     def masked(self, tree: T) -> T:
         """Arrays, NaN where the solve failed."""
-        return jax.tree.map(lambda x: jnp.where(self.converged, x, jnp.nan), tree)
+        found = once(self.converged)
+        return jax.tree.map(lambda x: jnp.where(found, x, jnp.nan), tree)
 
     def value(self, name: str) -> Any:
         """The quantity of the table with that name, also one that was added to it.
