@@ -5,8 +5,9 @@ float32 and float64, in one run.
 
 The batch draws tensions uniformly from [-15, 0] N. "gradient" is the derivative of a tip
 coordinate, summed over the batch, with respect to every number of every routing. `--cold` adds the
-times from a cold process to the first tip of B1, of a rod and of a catheter under load, and to the
-catheter's first gradient; and the same with programs that a process before has compiled.
+times from a cold process to the first tip of B1, of a rod and of a catheter under load, to the
+catheter's first gradient, and to the first derivatives of the tip that the package computes; the
+same without `quick_compilation`, and with programs that a process before has compiled.
 """
 
 import argparse
@@ -35,6 +36,7 @@ import time; start = time.perf_counter()
 import jax; jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp
 import vsr_jax as vsr
+from vsr_jax.numerics import compiling
 {options}
 imported = time.perf_counter()
 {scene}
@@ -70,14 +72,22 @@ COLD_JOBS = {
     "B1, tip": ("B1", "tip(inputs)"),
     "steel rod under load, tip": ("steel rod under load", "tip(inputs)"),
     "catheter under load, tip": ("catheter under load", "tip(inputs)"),
-    "catheter under load, gradient": ("catheter under load", "jax.jit(jax.grad(tip))(inputs)"),
+    "catheter under load, gradient": (
+        "catheter under load",
+        "jax.jit(jax.grad(tip), compiler_options=compiling.quick_compilation())(inputs)",
+    ),
+    "steel rod under load, compliance": (
+        "steel rod under load",
+        "vsr.compliance(vsr.solve(scene, inputs, model=model))",
+    ),
+    "catheter under load, jacobian of the tip": (
+        "catheter under load",
+        "vsr.tip_jacobian(vsr.solve(scene, inputs, model=model))",
+    ),
 }
 COLD_OPTIONS = {
     "as installed": "",
-    "without quick_compilation": """
-from vsr_jax.numerics import compiling
-compiling.quick_compilation = dict
-""",
+    "without quick_compilation": "compiling.quick_compilation = dict",
     "from the cache": """
 jax.config.update("jax_compilation_cache_dir", {folder!r})
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
