@@ -97,7 +97,7 @@ def exp_components(omega: Vector) -> tuple[Matrix, Vector]:
     """`exp` on a tuple of six component arrays: the rotation as rows of components and the
     translation."""
     k, u = omega[:3], omega[3:]
-    a, b, c3 = (once(x) for x in exp_coefficients(c.dot(k, k)))
+    a, b, c3 = exp_coefficients(c.dot(k, k))
     ku = c.cross(k, u)
     kku = c.cross(k, ku)
     translation = tuple(p + b * q + c3 * s for p, q, s in zip(u, ku, kku, strict=True))

@@ -23,7 +23,6 @@ from jaxtyping import Array, Bool, Float
 from ..arm.scene import Scene
 from ..models.base import Status
 from ..numerics.compiling import quick_jit
-from ..numerics.once import once
 from ..numerics.quadrature import onto
 from ..typing import VectorLike
 from ..validation import ROUNDING, choice, on_arm
@@ -53,8 +52,7 @@ class Solved(eqx.Module):
 
     def masked(self, tree: T) -> T:
         """Arrays, NaN where the solve failed."""
-        found = once(self.converged)
-        return jax.tree.map(lambda x: jnp.where(found, x, jnp.nan), tree)
+        return jax.tree.map(lambda x: jnp.where(self.converged, x, jnp.nan), tree)
 
     def value(self, name: str) -> Any:
         """The quantity of the table with that name, also one that was added to it.
