@@ -238,7 +238,7 @@ def followed(
     late = [i for i, one in enumerate(problem.couplings) if one.follows_rate]
     if not late:
         return step
-    step = jax.tree.map(once, step)
+    step = jax.tree.map(once, step)  # in reverse mode, the whole way back from the rows
     coupled = list(step.coupled)
     for i in late:
         coupled[i] = jax.tree.map(jnp.zeros_like, coupled[i])

@@ -39,7 +39,6 @@ def quick_jit(function: F) -> F:
     return cast(F, call)
 
 
-@cache
 def quick_compilation() -> dict[str, bool | int]:
     """Compiler options with which large programs compile in half to two thirds of the time on CPU:
     `jax.jit(function, compiler_options=vsr.quick_compilation())`.
@@ -60,8 +59,14 @@ def quick_compilation() -> dict[str, bool | int]:
     level = "xla_backend_optimization_level"
     if level not in os.environ.get("XLA_FLAGS", ""):
         options[level] = 2
+    return options if _known(tuple(options.items())) else {}
+
+
+@cache
+def _known(options: tuple[tuple[str, bool | int], ...]) -> bool:
+    """Whether XLA knows compiler options."""
     try:
-        jax.jit(lambda x: x, compiler_options=options).lower(0.0).compile()
+        jax.jit(lambda x: x, compiler_options=dict(options)).lower(0.0).compile()
     except (RuntimeError, ValueError):
-        return {}
-    return options
+        return False
+    return True
