@@ -45,25 +45,36 @@ def test_a_batch_in_any_axis(axis):
     np.testing.assert_array_equal(jax.jit(jax.vmap(once, axis, axis))(x), x)
 
 
-def test_infinities_stay():
-    x = jnp.asarray([jnp.inf, -jnp.inf, 1.0])
-    np.testing.assert_array_equal(jax.jit(once)(x), x)
+@pytest.mark.parametrize("shape", [(), (1,), (2, 1)])
+def test_infinities_stay(shape):
+    for value in (jnp.inf, -jnp.inf, jnp.nan):
+        x = jnp.full(shape, value)
+        np.testing.assert_array_equal(jax.jit(once)(x), x)
 
 
-def fused(keep, products, dtype):
-    """Number of fused operations in the compiled program of a chain of products of matrices."""
+def squared(x):
+    return total(x[:, :, None] * x[None], 1)
+
+
+def turned(x):
+    return x * x[::-1] + x
+
+
+def fused(step, keep, x):
+    """Number of fused operations in the compiled program of a chain of six steps."""
 
     def chain(x):
-        for _ in range(products):
-            x = keep(total(x[:, :, None] * x[None], 1))
+        for _ in range(6):
+            x = keep(step(x))
         return x
 
-    text = jax.jit(chain).lower(jnp.ones((3, 3, 48), dtype)).compile().as_text()
-    return text.count(" fusion(")
+    return jax.jit(chain).lower(x).compile().as_text().count(" fusion(")
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-def test_the_compiler_fuses_nothing_across_it(dtype):
+@pytest.mark.parametrize(("step", "shape"), [(squared, (3, 3, 48)), (turned, (48,))])
+def test_the_compiler_fuses_nothing_across_it(step, shape, dtype):
     """It must be noticed if a newer XLA knows how to remove what `once` puts in."""
-    assert fused(once, 6, dtype) == 6
-    assert fused(lambda x: x, 6, dtype) < 6
+    x = jnp.ones(shape, dtype)
+    assert fused(step, once, x) == 6
+    assert fused(step, lambda x: x, x) < 6

@@ -7,21 +7,30 @@ arithmetic (measured: the elimination of a batch in contact takes sixteen times 
 it, but two operations are never repeated: a division and a gather.
 """
 
+import math
+
 import jax.numpy as jnp
+from jax import lax
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
 
 def once(x: Array) -> Array:
-    """The same values, computed once; of floats and of truth values. Derivatives of both modes are
-    computed once too."""
+    """The same values, computed once; of finite floats, in double precision infinite ones too, and
+    of truth values. Derivatives of both modes are computed once too."""
     return _once.bind(x.astype(jnp.float32)) > 0 if x.dtype == bool else _once.bind(x)
 
 
 def _divided(x: Array) -> Array:
-    """The values divided by one, which XLA cannot know."""
+    """The values divided by one, which XLA cannot know; an infinity becomes NaN."""
     return x / (1.0 + 0.0 * x)
+
+
+def _clamped(x: Array) -> Array:
+    """As `_divided`, for infinities too; in single precision this costs a batch a fifth."""
+    one = jnp.ones((), x.dtype)
+    return x / (1.0 + 0.0 * lax.clamp(-one, x, one))
 
 
 def _gathered(x: Array) -> Array:
@@ -31,8 +40,11 @@ def _gathered(x: Array) -> Array:
 
 
 def _kept(x: Array) -> Array:
-    """The cheaper of both: a division in double precision takes longer than a gather."""
-    return _gathered(x) if x.ndim and x.dtype == jnp.float64 else _divided(x)
+    """The cheapest: a division in double precision takes longer than a gather. Of one row, XLA sees
+    that a gather changes nothing."""
+    if x.dtype != jnp.float64:
+        return _divided(x)
+    return _gathered(x) if math.prod(x.shape[:-1]) > 1 else _clamped(x)
 
 
 _once = Primitive("once")
