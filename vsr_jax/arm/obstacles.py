@@ -17,8 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..numerics.component import norm, split
-from ..numerics.stacked import matvec, transpose
+from ..numerics.component import dot, join, norm, split
 from ..typing import ArrayLike, MatrixLike, Pose, Scalar, VectorLike
 from ..validation import concrete, numbers, rigid
 from .description import Part
@@ -74,7 +73,10 @@ class Obstacle(Part):
 
 def local_point(pose: Pose | None, point: Position) -> Position:
     """A point of the world in the axes of a pose, $R^T (p - r)$; None is the identity."""
-    return point if pose is None else matvec(transpose(pose[:3, :3]), point - pose[:3, 3])
+    if pose is None:
+        return point
+    apart = split(point - pose[:3, 3])
+    return join(tuple(dot(split(pose[:3, j]), apart) for j in range(3)))
 
 
 def coefficient(name: str, friction: ArrayLike | None) -> Scalar | None:
@@ -125,7 +127,8 @@ class Plane(Obstacle):
             raise ValueError(f"Plane.normal: got {normal!r}, need a direction, not zeros")
 
     def distance(self, point: Position) -> Scalar:
-        return jnp.sum(self.normal * (point - self.point)) / norm(split(self.normal))
+        normal = split(self.normal)
+        return dot(normal, split(point - self.point)) / norm(normal)
 
     @property
     def sizes(self) -> dict[str, Array]:

@@ -128,7 +128,7 @@ class _Curves(NamedTuple):
     def point(self, s: Array, excess: Array, slide: Array, nearer: Array) -> Nearest:
         """What is known of points at places in the steps, the rest given."""
         place, along, _ = self.places(s)
-        distance, normal, bend = self.of_obstacles(_shape, place)
+        distance, normal, bend = self.shapes(place)
         outline = self.outlines(s)
         gap = distance - outline
         moved = jnp.concatenate([cross(along, normal), matvec(bend, along)])
@@ -143,6 +143,23 @@ class _Curves(NamedTuple):
             first = place + s * first
             place = power + s * place
         return place, first, second
+
+    def shapes(self, place: Array) -> tuple[Array, Array, Array]:
+        """Distances at positions, their gradients and their second derivatives.
+
+        These are the changes of the gradients of all points by their motion along each axis: arms
+        stay the last axis."""
+
+        def slopes(place: Array) -> tuple[Array, Array]:
+            distance, normal = self.of_obstacles(_slope, place)
+            return normal, distance
+
+        def bent(axis: Array) -> tuple[Array, Array, Array]:
+            along = jnp.broadcast_to(axis.reshape(3, *(1,) * (place.ndim - 1)), place.shape)
+            normal, change, distance = jax.jvp(slopes, (place,), (along,), has_aux=True)
+            return distance, normal, change
+
+        return jax.vmap(bent, out_axes=(None, None, 1))(jnp.eye(3, dtype=place.dtype))
 
     def gaps(self, s: Array) -> Array:
         """Gaps at places in the steps."""
@@ -243,15 +260,9 @@ def _outline_along(rod: Rod, X: Array, h: Array) -> tuple[Array, Array]:
     return jax.jvp(slope, (X,), (h,))
 
 
-def _shape(obstacle: Obstacle, place: Array) -> tuple[Array, Array, Array]:
-    """The distance at a place, its gradient and its second derivatives."""
-
-    def normal(place: Array) -> tuple[Array, tuple[Array, Array]]:
-        distance, slope = jax.value_and_grad(obstacle.distance)(place)
-        return slope, (distance, slope)
-
-    bend, (distance, slope) = jax.jacfwd(normal, has_aux=True)(place)
-    return distance, slope, bend
+def _slope(obstacle: Obstacle, place: Array) -> tuple[Array, Array]:
+    """The distance at a place and its gradient."""
+    return jax.value_and_grad(obstacle.distance)(place)
 
 
 def _search(curves: _Curves, first: Array) -> Array:
