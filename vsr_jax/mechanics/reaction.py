@@ -234,7 +234,7 @@ def partial_rotation(k: Array, h: Array, sigma: Array | float) -> Array:
     """
     stages = k.shape[1]
     near = k[:, stages // 2]  # differences from it are exact, or nearly
-    b = weighted(interpolation(stages, 0.5), k - near[:, None], axis=1)
+    b = once(weighted(interpolation(stages, 0.5), k - near[:, None], axis=1))
     h, middle = h * sigma, 0.5 * (sigma - 1.0)
     first = near + b[0]
     if stages == 1:
@@ -243,8 +243,8 @@ def partial_rotation(k: Array, h: Array, sigma: Array | float) -> Array:
         mean = h * (first + middle * b[1])
         return mean + h * sigma / 12 * cross(mean, b[1])
     bend = middle * b[2]
-    mean = h * (first + middle * (b[1] + bend))
-    slope = h * sigma * (b[1] + 2.0 * bend)
+    mean = once(h * (first + middle * (b[1] + bend)))
+    slope = once(h * sigma * (b[1] + 2.0 * bend))
     return magnus_6(mean, slope, h * sigma * sigma * b[2], cross)
 
 

@@ -68,8 +68,8 @@ def dot(a: Array, b: Array) -> Array:
 
 def cross(a: Array, b: Array) -> Array:
     """Vector product of two vectors."""
-    a, b = jnp.concatenate([a, a]), jnp.concatenate([b, b])
-    return rows(a, 1, 4) * rows(b, 2, 5) - rows(a, 2, 5) * rows(b, 1, 4)
+    (x, y, z), (u, v, w) = ([rows(p, i, i + 1) for i in range(3)] for p in (a, b))
+    return jnp.concatenate([y * w - z * v, z * u - x * w, x * v - y * u])
 
 
 def affine(a: Array, v: Array) -> Array:
