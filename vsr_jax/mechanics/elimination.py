@@ -44,9 +44,11 @@ from .elimination_nodes import (
     Definiteness,
     asymmetry_of,
     at_last_nodes,
+    at_node,
     definiteness,
     inverse_block,
     jumps,
+    places_of,
 )
 from .reaction import Reaction, Slopes
 
@@ -159,20 +161,22 @@ def eliminate(
         return spread(x, free), Definiteness(negative, jnp.zeros_like(unstable))
     nodes = _nodes(c.symmetric(lower), right, along, slopes, grid, flexible)
     arms, size = nodes.axis.shape[3:], 6 if slopes.motion else 3
-    nodes = _apart(nodes, grid) if arms else nodes
     last = -1 - len(arms)  # the axis of the steps
     nothing = jnp.zeros((size, 3, *arms), nodes.axis.dtype)
-    end = nothing, nothing[:, 0]
+    end, joined = (nothing, nothing[:, 0]), nodes.joined
     if arms:  # of a batch one step at a time, which stays in the cache
+        places = places_of(grid)
+        nodes = _apart(nodes, grid)
+        joined = None if nodes.joined is None else nodes.joined[places]
 
-        def backward(end: tuple, node: StepNodes) -> tuple[tuple, tuple]:
-            node = jax.tree.map(once, node)
+        def backward(end: tuple, place: tuple[Array, Array]) -> tuple[tuple, tuple]:
+            node = _alone(at_node(nodes, place, len(arms)), last)
             sections, step, *found = _condensed(node, free)
             start, (joint, *others) = _joined(end, step)
             strain = _by_start(node, sections, step, joint)
             return start, (joint.turn, joint.turned, strain, *found, *others)
 
-        _, found = lax.scan(backward, end, _moved(nodes, last, 0), reverse=True)
+        _, found = lax.scan(backward, end, places, reverse=True)
         turn, turned_end, strain, local, stable, negative, asymmetry = found
         strain = _moved(strain, 0, last)
     else:
@@ -186,13 +190,12 @@ def eliminate(
         turn, more, joined = jax.tree.map(once, step)
         return c.times(joined, matvec(turn, theta) + more), theta
 
-    joined = _moved(nodes.joined, last, 0)
     _, theta = lax.scan(forward, nothing[:3, 0], (turn, turned_end, joined))
     by_theta, constant = strain
     found = matvec(by_theta, jnp.moveaxis(theta, 0, last)[:, None]) + constant
-    found = turned(transpose(nodes.rotation), found)
     if arms:
         found = found.reshape(6, *grid.X.shape[1::-1], *arms).swapaxes(1, 2)
+    found = turned(transpose(nodes.rotation), found)
     # turning a strain into the world frame and back leaves rounding in those that are locked
     strain = spread(free_components(stacked.components(found), free), free)
     return strain, definiteness(negative + local, stable, asymmetry, grid)
@@ -238,22 +241,20 @@ def _nodes(
 
 def _apart(nodes: StepNodes, grid: Grid) -> StepNodes:
     """Each node as a step of its own, whose length is its weight."""
-    stages, steps = grid.X.shape[:2]
+    stages, jump, joined = grid.X.shape[0], nodes.jump, nodes.joined
+    return nodes._replace(
+        h=jnp.broadcast_to(grid.weight, nodes.axis.shape[1:]),
+        jump=None if jump is None else at_last_nodes(jump, stages),
+        joined=None
+        if joined is None
+        else 1.0 - at_last_nodes(1.0 - joined[None, None], stages)[0, 0],
+    )
 
-    def own(x: Array, place: int) -> Array:
-        shape = (*x.shape[:place], 1, stages * steps, *x.shape[place + 2 :])
-        return x.swapaxes(place, place + 1).reshape(shape)
 
-    apart = nodes._replace(h=None, jump=None, joined=None)
-    apart = jax.tree.map(lambda x: own(x, x.ndim - nodes.axis.ndim + 1), apart)
-    jump = nodes.jump
-    if jump is not None:
-        jump = own(at_last_nodes(jump, stages), 2)[:, :, 0]
-    joined = nodes.joined
-    if joined is not None:
-        joined = own(1.0 - at_last_nodes((1.0 - joined)[None, None], stages), 2)[0, 0, 0]
-    h = own(jnp.broadcast_to(grid.weight, nodes.axis.shape[1:]), 0)[0]
-    return apart._replace(h=h, jump=jump, joined=joined)
+def _alone(node: StepNodes, last: int) -> StepNodes:
+    """A step of one node, with the axis of nodes in the place before the last axes."""
+    along = jax.tree.map(lambda x: jnp.expand_dims(x, last), node)
+    return along._replace(h=node.h, jump=node.jump, joined=node.joined)
 
 
 def _moved(tree: Tree, source: int, destination: int) -> Tree:

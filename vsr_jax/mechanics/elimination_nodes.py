@@ -3,11 +3,15 @@ derivatives of the loads at points."""
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array
 
 from ..numerics import stacked
+from ..numerics.component import Tree
+from ..numerics.once import once
 from ..numerics.quadrature import Grid
 from .reaction import Slopes
 
@@ -59,6 +63,27 @@ def inverse_block(matrix: Array, places: tuple[int, ...]) -> tuple[Array, Array]
     negative = sum((x.astype(jnp.int32) for x in changes[1:]), changes[0].astype(jnp.int32))
     inverse = adjugate / (det * scale)
     return inverse if len(places) == 3 else jnp.where(block, inverse, 0.0), negative
+
+
+def places_of(grid: Grid) -> tuple[Array, Array]:
+    """Stage and step of each node, from the base to the tip."""
+    stages, steps = grid.X.shape[:2]
+    return jnp.tile(jnp.arange(stages), steps), jnp.repeat(jnp.arange(steps), stages)
+
+
+def at_node(tree: Tree, place: tuple[Array, Array], arms: int) -> Tree:
+    """Values (..., *arms) at the stage and the step of a node, of arrays (..., stages, steps,
+    *arms) with so many axes of arms.
+
+    A pass takes them from where they are: to bring the nodes into its order first would copy the
+    arrays."""
+    stage, step = place
+
+    def own(x: Array) -> Array:
+        x = lax.dynamic_index_in_dim(x, step, x.ndim - arms - 1, keepdims=False)
+        return once(lax.dynamic_index_in_dim(x, stage, x.ndim - arms - 1, keepdims=False))
+
+    return jax.tree.map(own, tree)
 
 
 def jumps(slopes: Slopes, grid: Grid) -> Array | None:

@@ -32,10 +32,8 @@ Contacts on neighbouring steps are so near to each other that the compliance of 
 decides on their forces.
 """
 
-from functools import partial
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
@@ -61,9 +59,11 @@ from .elimination_nodes import (
     Definiteness,
     asymmetry_of,
     at_last_nodes,
+    at_node,
     definiteness,
     inverse_block,
     jumps,
+    places_of,
 )
 from .reaction import Reaction, Slopes
 
@@ -74,7 +74,9 @@ class Hinge(NamedTuple):
 
     - `width` w; `link`: vector d to the end of the cell; `rotation` of the section.
     - `lever`: $(\tilde d, 0)$, shape (3, 7).
-    - `stiff`: $H + H_w$; `given`: $(-\tfrac12 A, b)$, shape (6, 7).
+    - `stiff`: $H + H_w$ in blocks (3, 3): of bending and, of size 6, of bending with linear strains
+      and of these.
+    - `given`: $(-\tfrac12 A, b)$, shape (6, 7).
     - `load`: derivative by the motion at the end of the cell of the loads there, and their right
       side, shape (6, 7).
     - `flexible`: 1, or 0 where the section is rigid; None without rigid pieces.
@@ -86,7 +88,7 @@ class Hinge(NamedTuple):
     link: Array
     rotation: Array
     lever: Array
-    stiff: Array
+    stiff: tuple[Array, ...]
     given: Array
     load: Array
     flexible: Array | None
@@ -111,14 +113,17 @@ def eliminate_poses(
     H = c.symmetric(lower)
     arms = jnp.broadcast_shapes(*(x.shape[2:] for x in (*H[0], *right, grid.weight, along.axis[0])))
     hinges = _hinges(H, right, along, slopes, grid, free, flexible, push, arms)
-    hinges = jax.tree.map(lambda x: jnp.moveaxis(x, -1 - len(arms), 0), hinges)
     none = jnp.zeros((3, 7, *arms), hinges.width.dtype)
-    _, (X, negative, asymmetry) = lax.scan(
-        partial(_before, free), (none, none), hinges, reverse=True
-    )
+    places = places_of(grid)
+
+    def backward(end: tuple[Array, Array], place: tuple[Array, Array]) -> tuple[tuple, tuple]:
+        return _before(free, end, at_node(hinges, place, len(arms)))
+
+    _, (X, negative, asymmetry) = lax.scan(backward, (none, none), places, reverse=True)
 
     def forward(z: Array, hinge: tuple) -> tuple[Array, Array]:
-        X, link, width = jax.tree.map(once, hinge)
+        X = once(hinge[0])
+        link, width = at_node((hinges.link, hinges.width), hinge[1], len(arms))
         turn, shift = rows(z, 0, 3), rows(z, 3, 6)
         strain = once(affine(X, jnp.concatenate([turn, shift + cross(turn, link)])))
         bent = width * rows(strain, 0, 3)
@@ -128,7 +133,7 @@ def eliminate_poses(
         return once(jnp.concatenate([turn + bent, shift])), strain
 
     start = jnp.zeros((6, *arms), X.dtype)
-    _, strain = lax.scan(forward, start, (X, hinges.link, hinges.width))
+    _, strain = lax.scan(forward, start, (X, places))
     strain = jnp.moveaxis(strain, 0, 1)
     strain = strain.reshape(-1, *grid.X.shape[1::-1], *arms).swapaxes(1, 2)
     back = transpose(along.rotation)
@@ -145,10 +150,10 @@ def motions(strain: Vector, part: Array, along: Reaction, grid: Grid) -> Array:
     change = grid.weight * turned(along.rotation, stack(strain))
 
     def summed(x: Array) -> Array:
-        """Sums over the cells from the base."""
-        listed = x.swapaxes(1, 2)
-        flat = listed.reshape(3, -1, *listed.shape[3:])
-        return jnp.cumsum(flat, axis=1).reshape(listed.shape).swapaxes(1, 2)
+        """Sums over the cells from the base, that of each itself included."""
+        of_step = total(x, 1)
+        before = jnp.cumsum(of_step, axis=1) - of_step
+        return before[:, None] + jnp.cumsum(x, axis=1)
 
     bent, slid = rows(change, 0, 3), rows(change, 3, 6)
     ends, reach = summed(bent), 0.5 * grid.weight * along.axis
@@ -169,43 +174,43 @@ def _hinges(
     push: Array | None,
     arms: tuple[int, ...],
 ) -> Hinge:
-    """All hinges, in the axis in front of that of the arms."""
+    """All hinges, in the last axes (stages, steps, *arms)."""
+    shape = (*grid.X.shape[:2], *arms)
 
-    def listed(x: Array) -> Array:
-        """Nodes one after another of an array (..., stages, steps, *arms)."""
-        first = x.ndim - len(arms) - 2
-        x = jnp.broadcast_to(x, (*x.shape[: first + 2], *arms)).swapaxes(first, first + 1)
-        return once(x.reshape(*x.shape[:first], -1, *arms))
+    def whole(x: Array) -> Array:
+        return jnp.broadcast_to(x, (*x.shape[: x.ndim - len(shape)], *shape))
 
     def block(first: int, second: int) -> Array:
-        entries = [listed(H[first + i][second + j]) for i in range(3) for j in range(3)]
-        return jnp.stack(jnp.broadcast_arrays(*entries)).reshape(3, 3, -1, *arms)
+        entries = [whole(H[first + i][second + j]) for i in range(3) for j in range(3)]
+        return jnp.stack(entries).reshape(3, 3, *shape)
 
     def after(x: Array) -> Array:
         """Values at the next nodes, zero beyond the tip."""
-        place = x.ndim - len(arms) - 1
+        first = x.ndim - len(shape)
+        others = lax.slice_in_dim(x, 1, None, axis=first)
+        later = lax.slice_in_dim(lax.slice_in_dim(x, 0, 1, axis=first), 1, None, axis=first + 1)
         room = [(0, 0)] * x.ndim
-        room[place] = (0, 1)
-        return jnp.pad(lax.slice_in_dim(x, 1, None, axis=place), room)
+        room[first + 1] = (0, 1)
+        return jnp.concatenate([others, jnp.pad(later, room)], axis=first)
 
-    R, w, wrench = listed(along.rotation), listed(grid.weight), listed(along.world)
+    R, w, wrench = whole(along.rotation), whole(grid.weight), once(whole(along.world))
     m, n = rows(wrench, 0, 3), rows(wrench, 3, 6)
-    reach = 0.5 * w * listed(along.axis)  # from the node to the end of its cell
-    couple = m - cross(reach, n) - after(m + cross(reach, n))
-    load = jnp.concatenate([couple, n - after(n)])
+    reach = once(0.5 * w * whole(along.axis))  # from the node to the end of its cell
+    lever = once(cross(reach, n))
+    load = once(jnp.concatenate([m - lever - after(m + lever), n - after(n)]))
     jump = jumps(slopes, grid)
     if jump is not None:
-        jump = listed(at_last_nodes(jump, grid.X.shape[0]))
+        jump = whole(at_last_nodes(jump, grid.X.shape[0]))
     if slopes.density is not None:
-        density = 0.5 * w * listed(slopes.density)
+        density = 0.5 * w * whole(slopes.density)
         density = _carried(density, -reach) + _carried(after(density), after(reach))
         jump = density if jump is None else jump + density
-    b, stiff = turned(R, stack(tuple(listed(x) for x in right))), _seen_from(R, block(0, 0))
+    b = once(turned(R, stack(tuple(whole(x) for x in right))))
+    stiff = _seen_from(R, block(0, 0))
     even = matmul(skew(reach), skew(n))
-    stiff = stiff + 0.25 * w * (even + transpose(even))
+    stiff = [once(stiff + 0.25 * w * (even + transpose(even)))]
     if max(free) > 2:
-        mixed, linear = (_seen_from(R, block(i, 3)) for i in (0, 3))
-        stiff = _blocks(stiff, mixed, transpose(mixed), linear)
+        stiff += [_seen_from(R, block(i, 3)) for i in (0, 3)]
     load = _half(load)
     load = _blocks(-load[:3, :3], load[:3, 3:], -load[3:, :3], load[3:, 3:])
     load = load if jump is None else load + jump
@@ -213,12 +218,12 @@ def _hinges(
     load = _beside(load, none)
     inside = None
     if slopes.cells is not None and slopes.part is not None:
-        cells = _beside(listed(slopes.cells), none if push is None else listed(push))
-        inside = cells, listed(slopes.part)
+        cells = _beside(whole(slopes.cells), none if push is None else whole(push))
+        inside = cells, whole(slopes.part)
     given, lever = _beside(-_half(wrench), b), skew(reach)
     lever = jnp.pad(lever, [(0, 0), (0, 4), *[(0, 0)] * (lever.ndim - 2)])
-    flexible = None if flexible is None else listed(flexible)
-    return Hinge(w, reach, R, lever, stiff, given, load, flexible, inside)
+    flexible = None if flexible is None else whole(flexible)
+    return Hinge(w, reach, R, lever, tuple(stiff), given, load, flexible, inside)
 
 
 def _before(free: tuple[int, ...], end: tuple[Array, Array], hinge: Hinge) -> tuple[tuple, tuple]:
@@ -227,26 +232,18 @@ def _before(free: tuple[int, ...], end: tuple[Array, Array], hinge: Hinge) -> tu
     number of negative pivots and the asymmetry.
 
     Moments and forces are apart, since XLA does not fuse what joins arrays."""
-    hinge = jax.tree.map(once, hinge)
-    size, w = len(hinge.stiff), hinge.width
+    w = hinge.width
     load, given = (_halves(x) for x in (hinge.load, hinge.given))
     beyond = _before_link((end[0] + load[0], end[1] + load[1]), hinge.lever)
     # what a strain and a motion before the hinge do, and a strain to itself
     bent = twice = before = beyond
     if hinge.inside is not None:
         inside, part = _halves(hinge.inside[0]), hinge.inside[1]
-        moved = [once(part * x) for x in inside]
-        bent = tuple(once(x + y) for x, y in zip(beyond, moved, strict=True))
-        twice = tuple(once(x + part * y) for x, y in zip(beyond, moved, strict=True))
-        before = tuple(once(x + y) for x, y in zip(beyond, inside, strict=True))
-    right = tuple(once(x + y) for x, y in zip(bent, given, strict=True))[: size // 3]
-    D = [
-        [
-            hinge.stiff[3 * i : 3 * i + 3, 3 * j : 3 * j + 3] - w * twice[i][:, 3 * j : 3 * j + 3]
-            for j in range(size // 3)
-        ]
-        for i in range(size // 3)
-    ]
+        bent = tuple(x + part * y for x, y in zip(beyond, inside, strict=True))
+        twice = tuple(x + part**2 * y for x, y in zip(beyond, inside, strict=True))
+        before = tuple(x + y for x, y in zip(beyond, inside, strict=True))
+    right = tuple(once(x + y) for x, y in zip(bent, given, strict=True))
+    D = _pivot(hinge.stiff, w, twice)
     X, negative, compliance = _solved(D, right, hinge.rotation, free)
     if hinge.flexible is not None:
         bends = hinge.flexible > 0
@@ -255,12 +252,28 @@ def _before(free: tuple[int, ...], end: tuple[Array, Array], hinge: Hinge) -> tu
         negative = jnp.where(bends, negative, 0)
     start = []
     for Q, held, half in zip(bent, before, given, strict=True):
-        turning = once(w * (Q - half))
+        turning = once(w * columns(Q - half, 0, 3 * len(X)))
         parts = [_product(columns(turning, 3 * i, 3 * i + 3), x) for i, x in enumerate(X)]
         start.append(once(sum(parts, held)))
     start = _before_link((start[0], start[1]), hinge.lever)
     Q = columns(beyond[0], 0, 3)
     return start, (jnp.concatenate(X), negative, asymmetry_of(Q, None, compliance))
+
+
+def _pivot(
+    stiff: tuple[Array, ...], w: Array, twice: tuple[Array, ...]
+) -> tuple[tuple[Array, ...], ...]:
+    """The system of a hinge in blocks: its stiffness less what the arm beyond takes."""
+
+    def less(block: Array, i: int, j: int) -> Array:
+        return block - w * columns(twice[i], 3 * j, 3 * j + 3)
+
+    bending = less(stiff[0], 0, 0)
+    if len(stiff) == 1:
+        return ((bending,),)
+    _, mixed, linear = stiff
+    below = once(less(transpose(mixed), 1, 0))
+    return (bending, less(mixed, 0, 1)), (below, less(linear, 1, 1))
 
 
 def _half(wrench: Array) -> Array:
@@ -270,7 +283,7 @@ def _half(wrench: Array) -> Array:
 
 
 def _solved(
-    D: list[list[Array]], right: tuple[Array, ...], R: Array, free: tuple[int, ...]
+    D: tuple[tuple[Array, ...], ...], right: tuple[Array, ...], R: Array, free: tuple[int, ...]
 ) -> tuple[tuple[Array, ...], Array, Array]:
     """Solution of the system of a hinge, in blocks, for the free strains of a section with the
     rotation R, zero for the others, the number of negative eigenvalues of D, and the inverse of its
@@ -290,6 +303,7 @@ def _solved(
 
 def _inverse(matrix: Array, R: Array, places: tuple[int, ...]) -> tuple[Array, Array]:
     """Inverse for the free strains among three of the section, and its negative eigenvalues."""
+    matrix = once(matrix)
     if len(places) == 3:
         return inverse_block(matrix, places)
     inverse, negative = inverse_block(_seen_from(transpose(R), matrix), places)
