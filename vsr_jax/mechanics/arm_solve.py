@@ -144,7 +144,7 @@ class _Sizes(NamedTuple):
         grid, length = self.problem.grid, self.problem.length
         wrench = spread(imbalance.wrench, self.free)
         bent = shape_of(wrench, self.problem.sections, length)
-        square = jnp.sum(grid.weight * bent**2, axis=(0, 1)) / length
+        square = _over_nodes(grid.weight * bent**2) / length
         for coupling, rows in zip(self.problem.couplings, imbalance.coupled, strict=True):
             for size in coupling.row_sizes(rows, at, self.problem):
                 square = square + jnp.mean(size**2, axis=self._inner(size))
@@ -153,29 +153,32 @@ class _Sizes(NamedTuple):
     def turn(self, step: ArmUnknown) -> Array:
         """Total angle by which the step bends and twists the arm [rad]."""
         x, y, z = (jnp.abs(k) for k in cast(step.xi[:3], self.problem.grid.h.dtype))
-        return jnp.sum(self.problem.grid.weight * (x + y + z), axis=(0, 1))
+        return _over_nodes(self.problem.grid.weight * (x + y + z))
 
     def work(self, wrench: Vector, step: ArmUnknown) -> Array:
         """Work of the residual over a step, in single precision: only its sign and rough size
         matter."""
-        work = jnp.sum(
-            c.single(self.problem.grid.weight) * c.dot(wrench, free_components(step.xi, self.free)),
-            axis=(0, 1),
-        )
+        per_length = c.dot(wrench, free_components(step.xi, self.free))
+        work = _over_nodes(c.single(self.problem.grid.weight) * per_length)
         return work.astype(self.problem.grid.h.dtype)
 
     def dot(self, one: ArmUnknown, other: ArmUnknown) -> Array:
         """Scalar product of two steps by their elastic energy, in single precision."""
         stiffness, weight = c.single((self.problem.sections.stiffness, self.problem.grid.weight))
         terms = (s * x * y for s, x, y in zip(stiffness, one.xi, other.xi, strict=True))
-        total = jnp.sum(weight * sum(terms), axis=(0, 1))
-        return total.astype(self.problem.grid.h.dtype)
+        return _over_nodes(weight * sum(terms)).astype(self.problem.grid.h.dtype)
 
     def _inner(self, x: Array) -> tuple[int, ...]:
         return tuple(range(x.ndim - len(self.arms)))
 
     def _largest(self, x: Array) -> Array:
-        return jnp.max(jnp.abs(x), axis=self._inner(x))
+        return jnp.max(once(jnp.abs(x)), axis=self._inner(x))
+
+
+def _over_nodes(x: Array) -> Array:
+    """Sum over all nodes. The terms are an array of their own: in the loop of a sum XLA computes
+    them one by one, with all that leads to them."""
+    return jnp.sum(once(x), axis=(0, 1))
 
 
 def _changes(
@@ -231,7 +234,7 @@ def _iteration(
     def evaluate(unknown: ArmUnknown, damping: Array, share: Array, loose: Array) -> Damped:
         problem = whole.loosened(loose).with_share(share)
         at = state_of(unknown.xi, unknown.coupled, problem)
-        imbalance = imbalance_of(unknown, at, problem, free)
+        imbalance = jax.tree.map(once, imbalance_of(unknown, at, problem, free))
         step, definite, doubtful = approximate_solve(unknown, at, imbalance, problem, free, damping)
         slides = problem.dissipates
         if slides is not None:  # no pivot tells then

@@ -138,7 +138,7 @@ def _elimination(
             found, definiteness = one(*jax.tree.map(lambda x: x[0], (b, *push)))
             return tuple(x[None] for x in found), definiteness
         found, definiteness = jax.vmap(one)(b, *push)
-        return found, jax.tree.map(lambda x: x[0], definiteness)
+        return jax.tree.map(once, found), jax.tree.map(lambda x: x[0], definiteness)
 
     return solve
 

@@ -11,6 +11,7 @@ from jaxtyping import Array
 from ..numerics import component as c, lu
 from ..numerics.component import Vector
 from ..numerics.quadrature import Grid
+from ..numerics.stacked import components, stack
 from .border import listed
 from .elimination_nodes import Definiteness
 
@@ -26,12 +27,11 @@ def with_springs(solve: Solve, springs: Vector, grid: Grid, *, apart: bool) -> S
 
     **Arguments:** `apart`: solve for the springs apart from the right sides.
     """
-    weighted = tuple(grid.weight * w for w in springs)
+    weighted = stack(tuple(grid.weight * w for w in springs))
 
     def work(x: Vector) -> Array:
         """Work of the weighted springs over a change of strain, one number each."""
-        parts = [jnp.einsum("isn...,sn...->i...", w, v) for w, v in zip(weighted, x, strict=True)]
-        return sum(parts[1:], parts[0])
+        return jnp.einsum("cisn...,csn...->i...", weighted, stack(x))
 
     def held_by(answers: Vector) -> Array:
         """The factors of $1 + W^T A^{-1} W$."""
@@ -50,10 +50,10 @@ def with_springs(solve: Solve, springs: Vector, grid: Grid, *, apart: bool) -> S
         else:
             x, definiteness = solve(b, *push)
         force = jax.vmap(partial(lu.substitute, factors), 1, 1)(jax.vmap(work, out_axes=1)(x))
-        less = (jnp.einsum("jk...,jsn...->ksn...", force, answer) for answer in answers)
+        less = jnp.einsum("jk...,cjsn...->cksn...", force, stack(answers))
         held = jnp.sum(lu.diagonal(factors) < 0, axis=0, dtype=jnp.int32)
         negative, doubtful = definiteness
-        return c.subtract(x, tuple(less)), Definiteness(negative - held, doubtful)
+        return c.subtract(x, components(less)), Definiteness(negative - held, doubtful)
 
     return stiffer
 
