@@ -253,8 +253,8 @@ def _apart(nodes: StepNodes, grid: Grid) -> StepNodes:
 
 def _alone(node: StepNodes, last: int) -> StepNodes:
     """A step of one node, with the axis of nodes in the place before the last axes."""
-    along = jax.tree.map(lambda x: jnp.expand_dims(x, last), node)
-    return along._replace(h=node.h, jump=node.jump, joined=node.joined)
+    step = jax.tree.map(lambda x: jnp.expand_dims(x, last), node)
+    return step._replace(h=node.h, jump=node.jump, joined=node.joined)
 
 
 def _moved(tree: Tree, source: int, destination: int) -> Tree:
