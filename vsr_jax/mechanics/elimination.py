@@ -25,6 +25,7 @@ That tangent is off by some percent, but a solve takes only one or two steps mor
 the memory traffic, which is what bounds a batch.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -45,10 +46,12 @@ from .elimination_nodes import (
     asymmetry_of,
     at_last_nodes,
     at_node,
+    block_of,
     definiteness,
     inverse_block,
     jumps,
     places_of,
+    whole,
 )
 from .reaction import Reaction, Slopes
 
@@ -212,29 +215,20 @@ def _nodes(
     """The nodes of all steps, in the last axes (stages, steps, *arms)."""
     everything = (*H[0], *right, grid.weight, *along.world, *along.axis)
     shape = jnp.broadcast_shapes(*(x.shape for x in everything))
-
-    def whole(x: Array) -> Array:
-        return jnp.broadcast_to(x, (*x.shape[: x.ndim - len(shape)], *shape))
-
-    jump = jumps(slopes, grid)
-
-    def block(first: int, second: int) -> Array:
-        entries = [H[first + i][second + j] for i in range(3) for j in range(3)]
-        return jnp.stack([whole(x) for x in entries]).reshape(3, 3, *shape)
-
+    jump, all_of = jumps(slopes, grid), partial(whole, shape=shape)
     return StepNodes(
         jnp.broadcast_to(grid.h, shape[1:]),
-        whole(along.rotation),
-        block(0, 0),
-        block(0, 3),
-        block(3, 3),
-        jnp.stack([whole(x) for x in right]),
-        whole(along.axis),
-        whole(along.world),
-        whole(along.density),
-        None if slopes.density is None else whole(slopes.density),
+        all_of(along.rotation),
+        block_of(H, 0, 0, shape),
+        block_of(H, 0, 3, shape),
+        block_of(H, 3, 3, shape),
+        jnp.stack([all_of(x) for x in right]),
+        all_of(along.axis),
+        all_of(along.world),
+        all_of(along.density),
+        None if slopes.density is None else all_of(slopes.density),
         None if jump is None else jnp.broadcast_to(jump, (*jump.shape[:2], *shape[1:])),
-        None if flexible is None else whole(flexible),
+        None if flexible is None else all_of(flexible),
         None if slopes.joined is None else jnp.broadcast_to(slopes.joined, shape[1:]),
     )
 

@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ..numerics import stacked
-from ..numerics.component import Tree
+from ..numerics.component import Matrix, Tree
 from ..numerics.once import once
 from ..numerics.quadrature import Grid
 from .reaction import Slopes
@@ -63,6 +63,17 @@ def inverse_block(matrix: Array, places: tuple[int, ...]) -> tuple[Array, Array]
     negative = sum((x.astype(jnp.int32) for x in changes[1:]), changes[0].astype(jnp.int32))
     inverse = adjugate / (det * scale)
     return inverse if len(places) == 3 else jnp.where(block, inverse, 0.0), negative
+
+
+def whole(x: Array, shape: tuple[int, ...]) -> Array:
+    """An array whose last axes are those of all nodes, (stages, steps, *arms)."""
+    return jnp.broadcast_to(x, (*x.shape[: x.ndim - len(shape)], *shape))
+
+
+def block_of(H: Matrix, first: int, second: int, shape: tuple[int, ...]) -> Array:
+    """Block (3, 3, stages, steps, *arms) of a matrix of all nodes, from two indices on."""
+    entries = [whole(H[first + i][second + j], shape) for i in range(3) for j in range(3)]
+    return jnp.stack(entries).reshape(3, 3, *shape)
 
 
 def places_of(grid: Grid) -> tuple[Array, Array]:

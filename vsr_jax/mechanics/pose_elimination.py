@@ -32,6 +32,7 @@ Contacts on neighbouring steps are so near to each other that the compliance of 
 decides on their forces.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -60,10 +61,12 @@ from .elimination_nodes import (
     asymmetry_of,
     at_last_nodes,
     at_node,
+    block_of,
     definiteness,
     inverse_block,
     jumps,
     places_of,
+    whole,
 )
 from .reaction import Reaction, Slopes
 
@@ -177,40 +180,25 @@ def _hinges(
     """All hinges, in the last axes (stages, steps, *arms)."""
     shape = (*grid.X.shape[:2], *arms)
 
-    def whole(x: Array) -> Array:
-        return jnp.broadcast_to(x, (*x.shape[: x.ndim - len(shape)], *shape))
-
-    def block(first: int, second: int) -> Array:
-        entries = [whole(H[first + i][second + j]) for i in range(3) for j in range(3)]
-        return jnp.stack(entries).reshape(3, 3, *shape)
-
-    def after(x: Array) -> Array:
-        """Values at the next nodes, zero beyond the tip."""
-        first = x.ndim - len(shape)
-        others = lax.slice_in_dim(x, 1, None, axis=first)
-        later = lax.slice_in_dim(lax.slice_in_dim(x, 0, 1, axis=first), 1, None, axis=first + 1)
-        room = [(0, 0)] * x.ndim
-        room[first + 1] = (0, 1)
-        return jnp.concatenate([others, jnp.pad(later, room)], axis=first)
-
-    R, w, wrench = whole(along.rotation), whole(grid.weight), once(whole(along.world))
+    all_of, after = partial(whole, shape=shape), partial(_after, axes=len(shape))
+    R, w, wrench = all_of(along.rotation), all_of(grid.weight), once(all_of(along.world))
     m, n = rows(wrench, 0, 3), rows(wrench, 3, 6)
-    reach = once(0.5 * w * whole(along.axis))  # from the node to the end of its cell
-    lever = once(cross(reach, n))
-    load = once(jnp.concatenate([m - lever - after(m + lever), n - after(n)]))
+    reach = once(0.5 * w * all_of(along.axis))  # from the node to the end of its cell
+    moment = once(cross(reach, n))
+    load = once(jnp.concatenate([m - moment - after(m + moment), n - after(n)]))
     jump = jumps(slopes, grid)
     if jump is not None:
-        jump = whole(at_last_nodes(jump, grid.X.shape[0]))
+        jump = all_of(at_last_nodes(jump, grid.X.shape[0]))
     if slopes.density is not None:
-        density = 0.5 * w * whole(slopes.density)
+        density = 0.5 * w * all_of(slopes.density)
         density = _carried(density, -reach) + _carried(after(density), after(reach))
         jump = density if jump is None else jump + density
-    b = once(turned(R, stack(tuple(whole(x) for x in right))))
-    stiff = _seen_from(R, block(0, 0))
+    b = once(turned(R, stack(tuple(all_of(x) for x in right))))
+    stiff = _seen_from(R, block_of(H, 0, 0, shape))
     even = matmul(skew(reach), skew(n))
     stiff = [once(stiff + 0.25 * w * (even + transpose(even)))]
     if max(free) > 2:
-        stiff += [_seen_from(R, block(i, 3)) for i in (0, 3)]
+        stiff += [_seen_from(R, block_of(H, i, 3, shape)) for i in (0, 3)]
     load = _half(load)
     load = _blocks(-load[:3, :3], load[:3, 3:], -load[3:, :3], load[3:, 3:])
     load = load if jump is None else load + jump
@@ -218,12 +206,22 @@ def _hinges(
     load = _beside(load, none)
     inside = None
     if slopes.cells is not None and slopes.part is not None:
-        cells = _beside(whole(slopes.cells), none if push is None else whole(push))
-        inside = cells, whole(slopes.part)
+        cells = _beside(all_of(slopes.cells), none if push is None else all_of(push))
+        inside = cells, all_of(slopes.part)
     given, lever = _beside(-_half(wrench), b), skew(reach)
     lever = jnp.pad(lever, [(0, 0), (0, 4), *[(0, 0)] * (lever.ndim - 2)])
-    flexible = None if flexible is None else whole(flexible)
+    flexible = None if flexible is None else all_of(flexible)
     return Hinge(w, reach, R, lever, tuple(stiff), given, load, flexible, inside)
+
+
+def _after(x: Array, axes: int) -> Array:
+    """Values at the next nodes, zero beyond the tip, with so many axes (stages, steps, *arms)."""
+    stage = x.ndim - axes
+    others = lax.slice_in_dim(x, 1, None, axis=stage)
+    later = lax.slice_in_dim(lax.slice_in_dim(x, 0, 1, axis=stage), 1, None, axis=stage + 1)
+    room = [(0, 0)] * x.ndim
+    room[stage + 1] = (0, 1)
+    return jnp.concatenate([others, jnp.pad(later, room)], axis=stage)
 
 
 def _before(free: tuple[int, ...], end: tuple[Array, Array], hinge: Hinge) -> tuple[tuple, tuple]:

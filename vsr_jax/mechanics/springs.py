@@ -29,28 +29,29 @@ def with_springs(solve: Solve, springs: Vector, grid: Grid, *, apart: bool) -> S
     """
     weighted = stack(tuple(grid.weight * w for w in springs))
 
-    def work(x: Vector) -> Array:
-        """Work of the weighted springs over a change of strain, one number each."""
-        return jnp.einsum("cisn...,csn...->i...", weighted, stack(x))
+    def work(x: Array) -> Array:
+        """Work (springs, k, ...) of the weighted springs over changes of strain."""
+        return jnp.einsum("cisn...,cksn...->ik...", weighted, x)
 
-    def held_by(answers: Vector) -> Array:
+    def held_by(answers: Array) -> Array:
         """The factors of $1 + W^T A^{-1} W$."""
-        gram = jax.vmap(work, out_axes=1)(answers)
+        gram = work(answers)
         one = jnp.eye(len(gram), dtype=gram.dtype)
         return lu.factor(gram + one.reshape(*one.shape, *(1,) * (gram.ndim - 2)))
 
-    known = solve(springs)[0] if apart else None
+    known = stack(solve(springs)[0]) if apart else None
     factored = None if known is None else held_by(known)
 
     def stiffer(b: Vector, *push: Array) -> tuple[Vector, Definiteness]:
         answers, factors = known, factored
         if answers is None or factors is None:
             x, answers, definiteness = solve_both(solve, (b, *push), springs)
+            answers = stack(answers)
             factors = held_by(answers)
         else:
             x, definiteness = solve(b, *push)
-        force = jax.vmap(partial(lu.substitute, factors), 1, 1)(jax.vmap(work, out_axes=1)(x))
-        less = jnp.einsum("jk...,cjsn...->cksn...", force, stack(answers))
+        force = jax.vmap(partial(lu.substitute, factors), 1, 1)(work(stack(x)))
+        less = jnp.einsum("jk...,cjsn...->cksn...", force, answers)
         held = jnp.sum(lu.diagonal(factors) < 0, axis=0, dtype=jnp.int32)
         negative, doubtful = definiteness
         return c.subtract(x, components(less)), Definiteness(negative - held, doubtful)
