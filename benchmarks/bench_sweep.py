@@ -2,12 +2,13 @@
 machine; a sweep of a million shapes, killed and resumed.
 
     pip install ".[sweep]" && python benchmarks/bench_sweep.py
-        [--json FILE] [--plot FILE] [--million]
+        [--json FILE] [--plot FILE] [--million] [--by STUDY ...]
 
 Unless a row states otherwise, the arm is the paper's B1 with one helical thread, at 16 steps of
 order 6, with tensions from [0, 15] N. All rates are those of `vsr.sweep` without compilation,
 including copies to and from the device: medians of several runs in turn, with the slowest and the
-fastest; those by cores are of a process each.
+fastest; those by cores are of a process each. Other devices than CPUs get sixteen times as many
+samples, and no rows by cores.
 
 `--million` sweeps a million shapes to disk in a separate process, kills it at a random time,
 resumes the sweep in another process, and compares the store with that of an uninterrupted sweep.
@@ -35,7 +36,8 @@ from vsr_jax.analysis.sweep_program import cores
 from vsr_jax.mechanics.balance import newton_step
 from vsr_jax.studies.timing import Timed, machine, take_turns
 
-SAMPLES = 16_384
+ON_CPU = jax.default_backend() == "cpu"
+SAMPLES = 16_384 if ON_CPU else 262_144
 STEPS = 16
 ROUNDS = 5
 MILLION = 1_000_000
@@ -129,38 +131,58 @@ def rates(jobs: dict[str, tuple[Callable, int]], rounds: int = ROUNDS) -> list[d
     return rows
 
 
-def studies() -> dict[str, list[dict[str, Any]]]:
-    """Rates of each study."""
-    gravity, many = (vsr.Gravity(),), tensions(SAMPLES)
-    few = 2048
-    by = {
-        "samples": {
-            f"{n:,} samples": (job(helix(), tensions(n)), n)
-            for n in (1, 10, 100, 1_000, 10_000, 100_000, MILLION)
-        }
-    }
-    by["nodes"] = {
-        f"{3 * n} nodes": (job(helix(), many, n), SAMPLES) for n in (2, 4, 8, 16, 32, 64)
-    }
-    by["threads"] = {
-        f"{n} threads": (job(helix(n), tensions(SAMPLES, n)), SAMPLES) for n in (1, 2, 3, 4, 6)
-    }
-    by["sections"] = {f"{n} sections": (job(helix(1, n), many), SAMPLES) for n in (1, 2, 4, 8)}
-    by["precision and loads"] = {
-        "float64": (job(helix(), many), SAMPLES),
-        "float32": (job(helix().astype("float32"), tensions(SAMPLES, dtype="float32")), SAMPLES),
-        "gravity, float64": (job(helix(loads=gravity), tensions(few)), few),
-        "gravity, float32": (
-            job(helix(loads=gravity).astype("float32"), tensions(few, dtype="float32")),
-            few,
-        ),
-    }
+def by_samples() -> dict[str, tuple[Callable, int]]:
+    """Sweeps of some to a million samples."""
+    sizes = (1, 10, 100, 1_000, 10_000, 100_000, MILLION)
+    return {f"{n:,} samples": (job(helix(), tensions(n)), n) for n in sizes}
+
+
+def by_nodes() -> dict[str, tuple[Callable, int]]:
+    """Coarse to fine arms."""
+    many = tensions(SAMPLES)
+    return {f"{3 * n} nodes": (job(helix(), many, n), SAMPLES) for n in (2, 4, 8, 16, 32, 64)}
+
+
+def by_threads() -> dict[str, tuple[Callable, int]]:
+    """One to six tendons."""
+    return {f"{n} threads": (job(helix(n), tensions(SAMPLES, n)), SAMPLES) for n in (1, 2, 3, 4, 6)}
+
+
+def by_sections() -> dict[str, tuple[Callable, int]]:
+    """One to eight sections."""
+    many = tensions(SAMPLES)
+    return {f"{n} sections": (job(helix(1, n), many), SAMPLES) for n in (1, 2, 4, 8)}
+
+
+def by_precision_and_loads() -> dict[str, tuple[Callable, int]]:
+    """Double and single precision, without and with gravity."""
     found = {}
-    for name, jobs in by.items():
-        print(f"\nby {name}")
-        found[name] = rates(jobs, 3 if name == "samples" else ROUNDS)
-    print("\nby cores")
-    found["cores"] = [row for n in dict.fromkeys((1, cores())) for row in on_cores(n)]
+    for what, loads, samples in (("", (), SAMPLES), ("gravity, ", (vsr.Gravity(),), SAMPLES // 8)):
+        for dtype in ("float64", "float32"):
+            scene = helix(loads=loads).astype(dtype)
+            found[what + dtype] = job(scene, tensions(samples, dtype=dtype)), samples
+    return found
+
+
+STUDIES: dict[str, Callable[[], dict[str, tuple[Callable, int]]]] = {
+    "samples": by_samples,
+    "nodes": by_nodes,
+    "threads": by_threads,
+    "sections": by_sections,
+    "precision and loads": by_precision_and_loads,
+}
+
+
+def studies(chosen: list[str] | None) -> dict[str, list[dict[str, Any]]]:
+    """Rates of each study, or of those that are chosen."""
+    found = {}
+    for name, study in STUDIES.items():
+        if not chosen or name in chosen:
+            print(f"\nby {name}")
+            found[name] = rates(study(), 3 if name == "samples" else ROUNDS)
+    if ON_CPU and (not chosen or "cores" in chosen):
+        print("\nby cores")
+        found["cores"] = [row for n in dict.fromkeys((1, cores())) for row in on_cores(n)]
     return found
 
 
@@ -210,6 +232,20 @@ def limit(batch_size: int = 512) -> dict[str, float]:
     taken = float(jnp.mean(jax.vmap(lambda u: vsr.solve(scene, u, model=model).steps)(inputs)))
     operations = counted[0] + (taken - 1) * counted[1]
     return {"machine_flops": machine_rate, "newton_steps": taken, "operations_a_shape": operations}
+
+
+def share_of_machine(rows: list[dict[str, Any]]) -> dict[str, float]:
+    """`limit`, and the share of it that the fastest sweep reaches."""
+    found = limit()
+    fastest = max(row["per_s"] for row in rows)
+    share = fastest * found["operations_a_shape"] / found["machine_flops"]
+    print(
+        "\n{operations_a_shape:,.0f} operations per shape, "
+        "{machine_flops:.2e} per second at most".format(**found),
+        end="",
+    )
+    print(f": the fastest sweep reaches {share:.0%} of that")
+    return found | {"share": share}
 
 
 def _most_operations(
@@ -316,6 +352,9 @@ def main() -> None:
     parser.add_argument(
         "--million", action="store_true", help="a million shapes to disk, killed once"
     )
+    parser.add_argument(
+        "--by", nargs="*", metavar="STUDY", choices=[*STUDIES, "cores"], help="only these studies"
+    )
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     report: dict[str, Any] = {
@@ -323,17 +362,9 @@ def main() -> None:
         "jax": jax.__version__,
     }
     print(f"{report['machine']}, jax {report['jax']}")
-    report["limit"] = limit()
-    report["rates"] = studies()
-    fastest = max(row["per_s"] for row in report["rates"]["samples"])
-    share = fastest * report["limit"]["operations_a_shape"] / report["limit"]["machine_flops"]
-    report["limit"]["share"] = share
-    print(
-        "\n{operations_a_shape:,.0f} operations per shape, "
-        "{machine_flops:.2e} per second at most".format(**report["limit"]),
-        end="",
-    )
-    print(f": the fastest sweep reaches {share:.0%} of that")
+    report["rates"] = studies(options.by)
+    if "samples" in report["rates"]:
+        report["limit"] = share_of_machine(report["rates"]["samples"])
     if options.million:
         report["million"] = million()
     if options.json:

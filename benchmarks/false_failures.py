@@ -26,15 +26,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # the systems are small
-os.environ.setdefault(
-    "XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
-)  # nothing is timed
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import vsr_jax as vsr
+from vsr_jax.cli.common import reduce_compile_time
 from vsr_jax.mechanics.resolution import COARSE
 
 try:
@@ -231,6 +229,7 @@ def main() -> None:
         help="also check the gradients, which takes three times as long to compile",
     )
     options = parser.parse_args()
+    reduce_compile_time(optimise=False)  # nothing is timed
     jax.config.update("jax_enable_x64", True)
     record = {}
     for name in options.structures:

@@ -18,16 +18,11 @@ are left out. A scene with too few points left is counted as at a switch.
 
 import argparse
 import json
-import os
 import time
 from collections.abc import Iterable
 from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
-
-os.environ.setdefault(
-    "XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
-)  # nothing is timed
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +30,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 import vsr_jax as vsr
+from vsr_jax.cli.common import reduce_compile_time
 
 SEED = 12
 STEPS = 8
@@ -402,6 +398,7 @@ def main() -> None:
     )
     parser.add_argument("--json", metavar="FILE")
     options = parser.parse_args()
+    reduce_compile_time(optimise=False)  # nothing is timed
     jax.config.update("jax_enable_x64", True)
     print(HEADER)
     rows = []

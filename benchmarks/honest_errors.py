@@ -12,20 +12,16 @@ The tolerance of each arm is drawn between 1e-7 and 1e-2 of its length; the erro
 
 import argparse
 import json
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
-
-os.environ.setdefault(
-    "XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
-)  # nothing is timed
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import vsr_jax as vsr
+from vsr_jax.cli.common import reduce_compile_time
 
 SEED = 6
 ROUNDED = 1e-11
@@ -213,6 +209,7 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=50, help="scenes of each kind")
     parser.add_argument("--json", metavar="FILE")
     options = parser.parse_args()
+    reduce_compile_time(optimise=False)  # nothing is timed
     jax.config.update("jax_enable_x64", True)
     random = np.random.default_rng(SEED)
     results = {kind: study(kind, options.scenes, random) for kind in KINDS}

@@ -18,10 +18,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault(
-    "XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
-)  # nothing is timed
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,6 +25,7 @@ from jax import lax
 from ordinary_scenes import STRUCTURES, Numbers, Structure, built
 
 import vsr_jax as vsr
+from vsr_jax.cli.common import reduce_compile_time
 
 SEED, STEPS = 19, 24
 EDGES = (0, 4, 6, 8, 10, 15, 20, 30, 50, 100, 1000)
@@ -100,6 +97,7 @@ def main() -> None:
     parser.add_argument("--against", type=Path, metavar="FOLDER")
     parser.add_argument("--json", type=Path, metavar="FILE")
     options = parser.parse_args()
+    reduce_compile_time(optimise=False)  # nothing is timed
     jax.config.update("jax_enable_x64", True)
     results = {"now": counted(options.draws)}
     if options.against:

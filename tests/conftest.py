@@ -11,10 +11,13 @@ import gc
 import os
 from pathlib import Path
 
+import jax
+
 os.environ.setdefault(
     "XLA_FLAGS",
-    "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 "
-    "--xla_cpu_parallel_codegen_split_count=1",
+    # XLA ends the process at a flag that it does not know, as this one since JAX 0.11
+    "--xla_cpu_use_fusion_emitters=false " * (jax.__version_info__ < (0, 11))
+    + "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1",
 )
 
 os.environ.setdefault("VSR_JAX_CACHE", "off")  # commands run here leave nothing behind
@@ -27,7 +30,6 @@ with jaxtyping.install_import_hook("vsr_jax", "beartype.beartype"):
     for name in vsr_jax.__all__:  # the face imports its modules when their names are first used
         getattr(vsr_jax, name)
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest

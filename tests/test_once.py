@@ -71,6 +71,7 @@ def fused(step, keep, x):
     return jax.jit(chain).lower(x).compile().as_text().count(" fusion(")
 
 
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="only CPUs need it")
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 @pytest.mark.parametrize(("step", "shape"), [(squared, (3, 3, 48)), (turned, (48,))])
 def test_the_compiler_fuses_nothing_across_it(step, shape, dtype):

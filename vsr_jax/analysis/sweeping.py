@@ -23,8 +23,11 @@ from .sweep_labels import labels
 from .sweep_program import Program, Task, number, stored_outputs
 from .sweep_store import Archive, InMemory
 
-_CHUNK = 16_384
-_MEMORY = 1 << 30
+_CHUNK, _CHUNK_ELSEWHERE = 16_384, 65_536
+"""Samples per chunk on CPUs, and per device otherwise: a GPU takes as long for thousands as for a
+hundred."""
+
+_MEMORY = 1 << 32
 
 Outputs: TypeAlias = str | Sequence[str] | Callable[[Equilibrium], Mapping[str, Any]]
 
@@ -107,10 +110,10 @@ def sweep(
     - `out`: a Zarr folder (`pip install "vsr-jax[sweep]"`), which `xarray.open_zarr` reads, see
       below. Each chunk is written when it is done. The same call resumes an interrupted sweep and
       reads a finished one; results are bit-identical on the same devices.
-    - `chunk`: samples per chunk, by default 16,384 on CPUs and 16,384 per device otherwise; an
+    - `chunk`: samples per chunk, by default 16,384 on CPUs and 65,536 per device otherwise; an
       existing folder keeps its own.
-    - `memory`: bound [bytes] on the intermediate values of all that is solved at once; it limits
-      the batch size.
+    - `memory`: bound [bytes] on the intermediate values of all that is solved at once, 4 GiB by
+      default; it limits the batch size.
     - `devices`: devices of this process to use, all by default.
     - `progress`: whether to show a bar with rate and remaining time.
 
@@ -184,7 +187,8 @@ def _joined(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
 
 
 def _chunk(devices: Mesh) -> int:
-    return _CHUNK if devices.devices.flat[0].platform == "cpu" else _CHUNK * devices.devices.size
+    on_cpu = devices.devices.flat[0].platform == "cpu"
+    return _CHUNK if on_cpu else _CHUNK_ELSEWHERE * devices.devices.size
 
 
 def _named(outputs: Outputs) -> tuple[str, ...] | Callable:

@@ -14,6 +14,7 @@ from ..numerics.batching import (
     TOGETHER,
     Iteration,
     arms_in,
+    at_once,
     iterated,
     queued,
     side_by_side,
@@ -40,8 +41,8 @@ from .coupling import ArmProblem, ArmState, clear_of, forces_at
 from .sizes import shape_of, shape_size
 
 _LANES, _QUEUED = 48, 1024
-"""Arms with constraints that are solved at a time, and those that wait in one queue, at most: some
-need four times as many steps as most."""
+"""Arms with constraints that are solved at a time on a CPU, and those that wait in one queue, at
+most: some need four times as many steps as most."""
 
 _START_STEPS = 4
 """Fixed-point steps to the start: each gains a factor of the strains that threads cause."""
@@ -199,8 +200,9 @@ def _solve(
 ) -> Root:
     arms = arms_in((origin, guess, whole), whole.grid.h.ndim - 1)
     given = whole, origin, guess, jnp.broadcast_to(rounding_of(whole), arms)
-    if _uneven(whole) and arms and arms[0] > _LANES:
-        root = queued(partial(_iteration, free, (_LANES,)), given, arms[0], _LANES)
+    lanes = at_once(_LANES)
+    if _uneven(whole) and arms and arms[0] > lanes:
+        root = queued(partial(_iteration, free, (lanes,)), given, arms[0], lanes)
     else:
         root = iterated(_iteration(free, arms, given))
     if whole.dissipates is None:

@@ -58,7 +58,8 @@ _LOOPED = 3
 """Threads from which on the program loops over them: two are faster side by side."""
 
 _TOGETHER = 1024
-"""Arms without loads that are solved together, at most; larger batches do not fit the caches."""
+"""Arms without loads that are solved together on a CPU, at most; larger batches do not fit its
+caches."""
 
 ALL = tuple(range(6))
 """Indices of all strains."""

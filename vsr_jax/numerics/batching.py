@@ -11,10 +11,16 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array
 
+from .compiling import on_cpu
 from .component import select
 
 TOGETHER = 136
-"""Arms that are solved together, at most: the arrays of one pass then stay in the cache."""
+"""Arms that are solved together on a CPU, at most: the arrays of one pass then stay in the
+cache."""
+
+_ELSEWHERE = 128
+"""Other devices solve so many times as many arms together: they take as long for thousands as for a
+hundred. The arrays of arms without loads, with loads or in contact then take about one GiB."""
 
 _ALIASED = 64
 """Numbers of arms that are multiples of this are raised by eight: their rows would all map to the
@@ -30,8 +36,8 @@ def side_by_side(solve: Callable, together: int = TOGETHER) -> Callable:
     length is a power of two.
 
     **Arguments:** `solve`: takes pytrees of arrays and returns one. For a batch each array has one
-    more axis at its end, of size 1 where it is the same for all arms. `together`: size of a part,
-    at most.
+    more axis at its end, of size 1 where it is the same for all arms. `together`: size of a part
+    on a CPU, at most (see `at_once`).
     """
 
     @custom_vmap
@@ -59,9 +65,16 @@ def side_by_side(solve: Callable, together: int = TOGETHER) -> Callable:
     return batched_solve
 
 
+def at_once(on_a_cpu: int) -> int:
+    """Number of arms that are solved together, at most, on the device in use, from that on a
+    CPU."""
+    return on_a_cpu if on_cpu() else _ELSEWHERE * on_a_cpu
+
+
 def in_parts(solve: Callable, together: int) -> Callable:
-    """`solve` with a rule for `jax.vmap` that cuts a batch of more than `together` into equal
-    parts, one solved after another, so that the arrays of a part stay in the cache."""
+    """`solve` with a rule for `jax.vmap` that cuts a batch of more than `together` arms (see
+    `at_once`) into equal parts, one solved after another, so that the arrays of a part stay in the
+    cache."""
 
     @custom_vmap
     def batched_solve(*arguments: Any) -> Any:
@@ -71,7 +84,7 @@ def in_parts(solve: Callable, together: int) -> Callable:
     def _(size: int, batched: list, *arguments: Any) -> tuple[Any, Any]:
         axes = jax.tree.map(lambda own: 0 if own else None, tuple(batched))
         solved = jax.vmap(solve, axes)
-        if size <= together:
+        if size <= at_once(together):
             return (result := solved(*arguments)), jax.tree.map(lambda _: True, result)
         rows = _rows(size, together)
         return _by_parts(lambda part: solved(*part), arguments, batched, size, rows)
@@ -80,8 +93,8 @@ def in_parts(solve: Callable, together: int) -> Callable:
 
 
 def _rows(size: int, together: int) -> int:
-    """Size of equal parts of a batch, none larger than `together`."""
-    parts = -(-size // together) or 1
+    """Size of equal parts of a batch, none larger than `at_once`."""
+    parts = -(-size // at_once(together)) or 1
     return -(-size // parts) or 1
 
 

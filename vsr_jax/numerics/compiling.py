@@ -1,4 +1,5 @@
-"""Programs that take longer to compile than to run."""
+"""The device that programs are compiled for, and programs that take longer to compile than to
+run."""
 
 import os
 from collections.abc import Callable
@@ -39,6 +40,13 @@ def quick_jit(function: F) -> F:
     return cast(F, call)
 
 
+def on_cpu() -> bool:
+    """Whether programs that are traced now run on a CPU."""
+    device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+    name = device if isinstance(device, str) else getattr(device, "platform", None)
+    return (name or jax.default_backend()) == "cpu"
+
+
 def quick_compilation() -> dict[str, bool | int]:
     """Compiler options with which large programs compile in half to two thirds of the time on CPU:
     `jax.jit(function, compiler_options=vsr.quick_compilation())`.
@@ -53,7 +61,7 @@ def quick_compilation() -> dict[str, bool | int]:
 
     **Returns:** the options; none on other devices than CPUs, or where XLA does not know them.
     """
-    if jax.default_backend() != "cpu":
+    if not on_cpu():
         return {}
     options: dict[str, bool | int] = {"xla_cpu_use_fusion_emitters": False}
     level = "xla_backend_optimization_level"
