@@ -130,3 +130,59 @@ def test_locked_strains_stay_at_rest():
     at, h = jnp.array([2.0]), 1e-4
     _, slope = jax.jvp(tip, (at,), (jnp.ones(1),))
     np.testing.assert_allclose(slope, (tip(at + h) - tip(at - h)) / (2 * h), rtol=1e-6, atol=1e-9)
+
+
+ACROSS = vsr.Cylinder(0.02, pose=vsr.pose((0.2, 0.0, -0.03), pointing=(0.0, 1.0, 0.0)))
+BY_STEPS = {
+    "spring": {"loads": BY_POSITION["spring"]},
+    "spinning": {"loads": BY_POSITION["spinning"]},
+    "bending only": {
+        "loads": BY_POSITION["spring"],
+        "free_strains": ("torsion", "bending_y", "bending_z"),
+    },
+    "in the plane": {"loads": BY_POSITION["spring"], "free_strains": ("bending_y", "elongation")},
+    "contact": {"loads": [vsr.Gravity()], "obstacles": ACROSS},
+    "held": {"loads": BY_POSITION["spring"], "held": vsr.Held(0.3, position=(0.2, 0.1, 0.0))},
+    "rigid": {"loads": BY_POSITION["spring"], "rigid": [vsr.RigidPiece(0.1, 0.25)]},
+}
+
+
+@pytest.mark.parametrize("name", BY_STEPS)
+def test_one_arm_step_by_step_is_a_batch_node_by_node(name):
+    """The same solution and the same verdict of definiteness, for states of all kinds."""
+    scene, model = dict(BY_STEPS[name]), vsr.StrainDependent(8)
+    rod = vsr.Rod(LENGTH, ROD.section, ROD.material, rigid=scene.pop("rigid", ()))
+    scene = vsr.Scene(rod, [TENDON], **scene)
+    free, problem = scene.free, problem_of(scene, jnp.array([5.0]), model.grid(scene))
+    coupled = tuple(one.guess(problem.forces, problem.grid) for one in problem.couplings)
+    rng = np.random.default_rng(0)
+
+    def smooth(sizes):
+        x = problem.grid.X / LENGTH
+        return [size * np.sin(3 * x + rng.uniform(0, 6)) for size in sizes]
+
+    @jax.jit
+    def solved(unknown, problem, right):
+        at = state_of(unknown.xi, unknown.coupled, problem)
+        return approximate_solve(unknown, at, right, problem, free)
+
+    def flat(step):
+        return np.concatenate([np.ravel(x) for x in jax.tree.leaves(step)])
+
+    verdicts = set()
+    for bend in (1.0, 3.0, 8.0, 20.0, 40.0):
+        change = smooth([bend] * 3 + [0.01] * 3)
+        xi = tuple(r + x for r, x in zip(problem.sections.rest, change, strict=True))
+        unknown = ArmUnknown(xi, coupled)
+        rows = imbalance_of(unknown, state_of(xi, coupled, problem), problem, free)
+        right = rows._replace(wrench=tuple(jnp.asarray(x) for x in smooth([1e-3] * len(free))))
+        step, definite, _ = solved(unknown, problem, right)
+        given = jax.tree.map(lambda x: x[..., None], (unknown, problem, right))
+        others, same, _ = solved(*given)
+        one, other = flat(step), flat(others)
+        # in single precision, but for contacts, whose stiffness takes half of the digits
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-4 * np.max(np.abs(other)))
+        assert bool(definite) == bool(same[0])
+        verdicts.add(bool(definite))
+    assert True in verdicts
+    assert (False in verdicts) == (name not in ("in the plane", "held"))

@@ -128,16 +128,16 @@ def _elimination(
 ) -> Solve:
     """The elimination for several right sides, and what pushes each of them."""
 
-    def one(b: Vector, *push: Array) -> tuple[Vector, Definiteness]:
-        if along is not None and slopes is not None and slopes.motion == 6:
-            return eliminate_poses(lower, b, along, slopes, grid, free, flexible, *push)
+    def one(b: Vector) -> tuple[Vector, Definiteness]:
         return eliminate(lower, b, along, slopes, grid, free, flexible)
 
     def solve(b: Vector, *push: Array) -> tuple[Vector, Definiteness]:
+        if along is not None and slopes is not None and slopes.motion == 6:
+            return eliminate_poses(lower, b, along, slopes, grid, free, flexible, *push)
         if len(b[0]) == 1:
-            found, definiteness = one(*jax.tree.map(lambda x: x[0], (b, *push)))
+            found, definiteness = one(tuple(x[0] for x in b))
             return tuple(x[None] for x in found), definiteness
-        found, definiteness = jax.vmap(one)(b, *push)
+        found, definiteness = jax.vmap(one)(b)
         return jax.tree.map(once, found), jax.tree.map(lambda x: x[0], definiteness)
 
     return solve

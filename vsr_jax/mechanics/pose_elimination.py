@@ -1,101 +1,45 @@
-r"""The tangent of the balance under loads that depend on positions, solved by block elimination.
+r"""The tangent of the balance under loads that depend on positions, solved by block elimination
+along the arm, a chain of hinges (see `pose_hinges`).
 
-As in `elimination`, each node represents a cell of its weight w, integrated by the midpoint rule:
-the arm is a chain of hinges at the nodes, which turn by $w\kappa$ and slide by $w\upsilon$, with
-stiff links between them. All is in the world's axes and, at each hinge, about its point. The motion
-of the arm beyond a hinge is $z = (\theta, \rho)$, rotation and displacement; the change of the
-wrench there, as seen by the moving section, is $Q z + q$. With the wrench $W = (m, n)$ and
+In a batch of arms a pass over all hinges from the tip to the base keeps the change of the wrench
+beyond each as an affine function of the motion, $\hat Q z + q$, and one from the base to the tip
+gives the motions.
 
-$$A = \begin{pmatrix} -\tilde m & -\tilde n \\ -\tilde n & 0 \end{pmatrix}, \quad
-\hat Q = Q + \tfrac12 A,$$
+One arm would wait for many small operations in that. Its hinges are put together step by step, all
+steps at once: by the same pass over the hinges of a step, with the wrench beyond its end, $W_1$, as
+further unknowns. With the motions $z_0, z_1$ at both ends of a step,
 
-$\hat Q$ is symmetric where the loads have a potential. It is the stiffness of the arm beyond,
-springs included, so that a stiff spring is eliminated exactly. A hinge with the strain $\delta\xi =
-(\kappa, \upsilon)$ and the motion z before it has
+$$z_1 = T z_0 + F W_1 + f, \quad W_0 = S z_0 + G W_1 + s.$$
 
-$$(H + H_w - w \hat Q) \, \delta\xi = (\hat Q - \tfrac12 A) z + q + b$$
+With $F = L U$, where $U = L^T$ if the loads have a potential, $y = U W_1$, and $W_1 = Q z_1 + q$ of
+the arm beyond,
 
-and before it is $\hat Q z + q + w (\hat Q + \tfrac12 A) \, \delta\xi$. A cell bends evenly, and
-not at a hinge: by the midpoint rule this adds $H_w = \tfrac{w^2}8 (\tilde u \tilde n + \tilde n
-\tilde u)$ to the bending stiffness, with the axis u; without it an arm that buckles seems too soft.
-A link of the vector d moves what is beyond it by $\rho + \theta \times d$. Loads between two nodes
-act at the end of the first cell: one with the wrench (c, f) and the derivative K by the motion
-there adds
+$$(1 - U Q L) \, y = U (Q (T z_0 + f) + q), \quad z_1 = T z_0 + f + L y, \quad
+W_1 = Q (T z_0 + f) + q + Q L y,$$
 
-$$K + \tfrac12 \begin{pmatrix} \tilde c & -\tilde f \\ \tilde f & 0 \end{pmatrix}.$$
-
-A contact acts inside a cell. Behind the part $\alpha$ of it the arm has moved by $z + \alpha w
-\delta\xi$, about the node; with the derivative K and a given change p of the wrench there, the
-hinge has $H + H_w - w (\hat Q + \alpha^2 K)$ and $(\hat Q - \tfrac12 A + \alpha K) z + q + \alpha p
-+ b$, and before it is $(\hat Q + K) z + q + p + w (\hat Q + \tfrac12 A + \alpha K) \, \delta\xi$.
-Contacts on neighbouring steps are so near to each other that the compliance of their own cells
-decides on their forces.
+so that a pass over the steps solves a 6 x 6 system for each, whose negative eigenvalues count with
+those of the hinges. The strains in a step follow from $z_0$ and y; from $W_1$, the small difference
+of large forces where a stiff contact is near, they would be less exact.
 """
 
-from functools import partial
-from typing import NamedTuple
-
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
 from ..numerics import component as c
-from ..numerics.component import Matrix, Vector
+from ..numerics.component import Matrix, Tree, Vector
 from ..numerics.once import once
 from ..numerics.quadrature import Grid
-from ..numerics.stacked import (
-    affine,
-    columns,
-    cross,
-    matmul,
-    matvec,
-    rows,
-    skew,
-    stack,
-    total,
-    transpose,
-    turned,
-)
-from .elimination_nodes import (
-    Definiteness,
-    asymmetry_of,
-    at_last_nodes,
-    at_node,
-    block_of,
-    definiteness,
-    inverse_block,
-    jumps,
-    places_of,
-    whole,
-)
+from ..numerics.stacked import columns, cross, matmul, rows, stack, total, transpose, turned
+from .balance import ALL
+from .elimination_nodes import Definiteness, asymmetry_of, at_node, definiteness, places_of
+from .pose_hinges import Hinge, before, behind, halves, hinges_of, product, solved
 from .reaction import Reaction, Slopes
 
-
-class Hinge(NamedTuple):
-    r"""The hinge at a node, of size 3 if only bending and twist are free, else 6, and the loads at
-    the end of its cell. All that the passes need is prepared for all hinges at once.
-
-    - `width` w; `link`: vector d to the end of the cell; `rotation` of the section.
-    - `lever`: $(\tilde d, 0)$, shape (3, 7).
-    - `stiff`: $H + H_w$ in blocks (3, 3): of bending and, of size 6, of bending with linear strains
-      and of these.
-    - `given`: $(-\tfrac12 A, b)$, shape (6, 7).
-    - `load`: derivative by the motion at the end of the cell of the loads there, and their right
-      side, shape (6, 7).
-    - `flexible`: 1, or 0 where the section is rigid; None without rigid pieces.
-    - `inside`: as `load`, of what acts in the cell, about the node, and the part of the cell before
-      it; None if nothing does.
-    """
-
-    width: Array
-    link: Array
-    rotation: Array
-    lever: Array
-    stiff: tuple[Array, ...]
-    given: Array
-    load: Array
-    flexible: Array | None
-    inside: tuple[Array, Array] | None
+_SINGULAR = 64
+"""Smallest pivot of the compliance of a step, relative to its diagonal, in machine epsilons: where
+strains are locked or pieces rigid, some are zero."""
 
 
 def eliminate_poses(
@@ -108,39 +52,27 @@ def eliminate_poses(
     flexible: Array | None = None,
     push: Array | None = None,
 ) -> tuple[Vector, Definiteness]:
-    """As `eliminate`, for motions of size 6.
+    """As `eliminate`, for motions of size 6 and several right sides.
 
-    **Arguments:** `push`: changes (6, stages, steps, *arms) of the wrenches in the cells in the
-    world frame, about the nodes, that do not depend on the motions, a right side too.
+    **Arguments:** `right`: six components (sides, stages, steps, *arms); `push`: changes (sides, 6,
+    stages, steps, *arms) of the wrenches in the cells in the world frame, about the nodes, that do
+    not depend on the motions, right sides too.
+
+    **Returns:** six components (sides, stages, steps, *arms).
     """
     H = c.symmetric(lower)
-    arms = jnp.broadcast_shapes(*(x.shape[2:] for x in (*H[0], *right, grid.weight, along.axis[0])))
-    hinges = _hinges(H, right, along, slopes, grid, free, flexible, push, arms)
-    none = jnp.zeros((3, 7, *arms), hinges.width.dtype)
-    places = places_of(grid)
-
-    def backward(end: tuple[Array, Array], place: tuple[Array, Array]) -> tuple[tuple, tuple]:
-        return _before(free, end, at_node(hinges, place, len(arms)))
-
-    _, (X, negative, asymmetry) = lax.scan(backward, (none, none), places, reverse=True)
-
-    def forward(z: Array, hinge: tuple) -> tuple[Array, Array]:
-        X = once(hinge[0])
-        link, width = at_node((hinges.link, hinges.width), hinge[1], len(arms))
-        turn, shift = rows(z, 0, 3), rows(z, 3, 6)
-        strain = once(affine(X, jnp.concatenate([turn, shift + cross(turn, link)])))
-        bent = width * rows(strain, 0, 3)
-        shift = shift + cross(2.0 * turn + bent, link)
-        if len(strain) == 6:
-            shift = shift + width * rows(strain, 3, 6)
-        return once(jnp.concatenate([turn + bent, shift])), strain
-
-    start = jnp.zeros((6, *arms), X.dtype)
-    _, strain = lax.scan(forward, start, (X, places))
-    strain = jnp.moveaxis(strain, 0, 1)
-    strain = strain.reshape(-1, *grid.X.shape[1::-1], *arms).swapaxes(1, 2)
+    places = [x.shape[2:] for x in (*H[0], grid.weight, along.axis[0])]
+    arms = jnp.broadcast_shapes(*places, *(x.shape[3:] for x in right))
+    size = (len(right[0]), *grid.X.shape[:2], *arms)
+    b = jnp.stack([jnp.broadcast_to(x, size) for x in right])
+    if push is not None:
+        push = jnp.broadcast_to(push.swapaxes(0, 1), b.shape)
+    unknowns = 0 if arms else 6
+    hinges = hinges_of(H, b, along, slopes, grid, free, flexible, push, unknowns)
+    passed = _node_by_node if arms else _step_by_step
+    strain, negative, asymmetry = passed(hinges, grid, free)
     back = transpose(along.rotation)
-    strain = jnp.concatenate([matvec(back, part) for part in jnp.split(strain, len(strain) // 3)])
+    strain = jnp.concatenate([matmul(back, part) for part in jnp.split(strain, len(strain) // 3)])
     local = jnp.ones(negative.shape, bool)
     # turning a strain into the world frame and back leaves rounding in those that are locked
     found = tuple(strain[i] if i in free else jnp.zeros_like(strain[0]) for i in range(6))
@@ -166,187 +98,152 @@ def motions(strain: Vector, part: Array, along: Reaction, grid: Grid) -> Array:
     return jnp.concatenate([ends - ahead * bent, there - ahead * slid])
 
 
-def _hinges(
-    H: Matrix,
-    right: Vector,
-    along: Reaction,
-    slopes: Slopes,
-    grid: Grid,
-    free: tuple[int, ...],
-    flexible: Array | None,
-    push: Array | None,
-    arms: tuple[int, ...],
-) -> Hinge:
-    """All hinges, in the last axes (stages, steps, *arms)."""
-    shape = (*grid.X.shape[:2], *arms)
+def _node_by_node(hinges: Hinge, grid: Grid, free: tuple[int, ...]) -> tuple[Array, Array, Array]:
+    """Strains in the world frame (size, sides, stages, steps, *arms), numbers of negative pivots
+    and asymmetries, by passes over all hinges."""
+    arms, width = hinges.width.shape[2:], hinges.given.shape[1]
+    none = jnp.zeros((3, width, *arms), hinges.width.dtype)
+    places = places_of(grid)
 
-    all_of, after = partial(whole, shape=shape), partial(_after, axes=len(shape))
-    R, w, wrench = all_of(along.rotation), all_of(grid.weight), once(all_of(along.world))
-    m, n = rows(wrench, 0, 3), rows(wrench, 3, 6)
-    reach = once(0.5 * w * all_of(along.axis))  # from the node to the end of its cell
-    moment = once(cross(reach, n))
-    load = once(jnp.concatenate([m - moment - after(m + moment), n - after(n)]))
-    jump = jumps(slopes, grid)
-    if jump is not None:
-        jump = all_of(at_last_nodes(jump, grid.X.shape[0]))
-    if slopes.density is not None:
-        density = 0.5 * w * all_of(slopes.density)
-        density = _carried(density, -reach) + _carried(after(density), after(reach))
-        jump = density if jump is None else jump + density
-    b = once(turned(R, stack(tuple(all_of(x) for x in right))))
-    stiff = _seen_from(R, block_of(H, 0, 0, shape))
-    even = matmul(skew(reach), skew(n))
-    stiff = [once(stiff + 0.25 * w * (even + transpose(even)))]
-    if max(free) > 2:
-        stiff += [_seen_from(R, block_of(H, i, 3, shape)) for i in (0, 3)]
-    load = _half(load)
-    load = _blocks(-load[:3, :3], load[:3, 3:], -load[3:, :3], load[3:, 3:])
-    load = load if jump is None else load + jump
-    none = jnp.zeros_like(wrench)
-    load = _beside(load, none)
-    inside = None
-    if slopes.cells is not None and slopes.part is not None:
-        cells = _beside(all_of(slopes.cells), none if push is None else all_of(push))
-        inside = cells, all_of(slopes.part)
-    given, lever = _beside(-_half(wrench), b), skew(reach)
-    lever = jnp.pad(lever, [(0, 0), (0, 4), *[(0, 0)] * (lever.ndim - 2)])
-    flexible = None if flexible is None else all_of(flexible)
-    return Hinge(w, reach, R, lever, tuple(stiff), given, load, flexible, inside)
+    def backward(end: tuple[Array, Array], place: tuple[Array, Array]) -> tuple[tuple, tuple]:
+        start, (X, negative, compliance, Q) = before(free, end, at_node(hinges, place, len(arms)))
+        return start, (X, negative, asymmetry_of(Q, None, compliance))
+
+    _, (X, negative, asymmetry) = lax.scan(backward, (none, none), places, reverse=True)
+
+    def forward(z: Array, hinge: tuple) -> tuple[Array, Array]:
+        X = once(hinge[0])
+        link, w = at_node((hinges.link, hinges.width), hinge[1], len(arms))
+        return behind(z, link, w, columns(X, 0, 6), columns(X, 6, width))
+
+    start = jnp.zeros((6, width - 6, *arms), X.dtype)
+    _, strain = lax.scan(forward, start, (X, places))
+    strain = jnp.moveaxis(strain, 0, 2)
+    strain = strain.reshape(*strain.shape[:2], *grid.X.shape[1::-1], *arms).swapaxes(2, 3)
+    return strain, negative, asymmetry
 
 
-def _after(x: Array, axes: int) -> Array:
-    """Values at the next nodes, zero beyond the tip, with so many axes (stages, steps, *arms)."""
-    stage = x.ndim - axes
-    others = lax.slice_in_dim(x, 1, None, axis=stage)
-    later = lax.slice_in_dim(lax.slice_in_dim(x, 0, 1, axis=stage), 1, None, axis=stage + 1)
-    room = [(0, 0)] * x.ndim
-    room[stage + 1] = (0, 1)
-    return jnp.concatenate([others, jnp.pad(later, room)], axis=stage)
+def _step_by_step(hinges: Hinge, grid: Grid, free: tuple[int, ...]) -> tuple[Array, Array, Array]:
+    """As `_node_by_node`, for one arm, by passes over the hinges of all steps at once and then over
+    the steps."""
+    found, pushed, negative, compliance = _condensed(hinges, grid, free)
+    count = len(found)
+    by_slide, U, left = _factors(columns(found, 6, 12))
+    found, pushed_by = (_without_wrench(x) for x in (found, pushed))
+    step = rows(by_slide, 0, 6), U, rows(found, 0, 6), pushed_by, columns(pushed, 6, 12)
+    z, y, W, more, Q = _joined(*step)
+    strain = _value(rows(found, 6, count), z) + product(rows(by_slide, 6, count), y)
+    strain = strain + product(rows(left, 6, count), W)
+    strain = strain.reshape(grid.X.shape[0], -1, *strain.shape[1:])
+    return jnp.moveaxis(strain, 0, 2), negative + more, asymmetry_of(Q, None, compliance)
 
 
-def _before(free: tuple[int, ...], end: tuple[Array, Array], hinge: Hinge) -> tuple[tuple, tuple]:
-    r"""One cell: from $\hat Q$ and q beyond its end to those at its start, the moments (3, 7) and
-    the forces; the affine strain by the motion of the section of the hinge before it (size, 7), the
-    number of negative pivots and the asymmetry.
+def _condensed(hinges: Hinge, grid: Grid, free: tuple[int, ...]) -> tuple[Array, ...]:
+    """The motions at the ends of all steps, followed by the strains of their nodes, and the
+    wrenches at their starts, (6 and more, columns, steps), by the motion at the start, the wrench
+    beyond the end and the right sides; the numbers of negative pivots and the compliance of the
+    first nodes."""
+    stages, steps = grid.X.shape
+    width = hinges.given.shape[1]
+    one = jnp.eye(6, width, dtype=hinges.width.dtype)
+    motion, wrench = (
+        jnp.broadcast_to(x[:, :, None], (6, width, steps)) for x in (one, jnp.roll(one, 6, 1))
+    )
 
-    Moments and forces are apart, since XLA does not fuse what joins arrays."""
-    w = hinge.width
-    load, given = (_halves(x) for x in (hinge.load, hinge.given))
-    beyond = _before_link((end[0] + load[0], end[1] + load[1]), hinge.lever)
-    # what a strain and a motion before the hinge do, and a strain to itself
-    bent = twice = before = beyond
-    if hinge.inside is not None:
-        inside, part = _halves(hinge.inside[0]), hinge.inside[1]
-        bent = tuple(x + part * y for x, y in zip(beyond, inside, strict=True))
-        twice = tuple(x + part**2 * y for x, y in zip(beyond, inside, strict=True))
-        before = tuple(x + y for x, y in zip(beyond, inside, strict=True))
-    right = tuple(once(x + y) for x, y in zip(bent, given, strict=True))
-    D = _pivot(hinge.stiff, w, twice)
-    X, negative, compliance = _solved(D, right, hinge.rotation, free)
-    if hinge.flexible is not None:
-        bends = hinge.flexible > 0
-        X = tuple(jnp.where(bends, x, 0.0) for x in X)
-        compliance = jnp.where(bends, compliance, 0.0)
-        negative = jnp.where(bends, negative, 0)
-    start = []
-    for Q, held, half in zip(bent, before, given, strict=True):
-        turning = once(w * columns(Q - half, 0, 3 * len(X)))
-        parts = [_product(columns(turning, 3 * i, 3 * i + 3), x) for i, x in enumerate(X)]
-        start.append(once(sum(parts, held)))
-    start = _before_link((start[0], start[1]), hinge.lever)
-    Q = columns(beyond[0], 0, 3)
-    return start, (jnp.concatenate(X), negative, asymmetry_of(Q, None, compliance))
+    def at_stage(tree: Tree, stage: Array) -> Tree:
+        return jax.tree.map(
+            lambda x: once(lax.dynamic_index_in_dim(x, stage, x.ndim - 2, keepdims=False)), tree
+        )
 
+    def backward(end: tuple[Array, Array], stage: Array) -> tuple[tuple, tuple]:
+        start, (X, negative, compliance, _) = before(free, end, at_stage(hinges, stage))
+        return start, (X, negative, compliance)
 
-def _pivot(
-    stiff: tuple[Array, ...], w: Array, twice: tuple[Array, ...]
-) -> tuple[tuple[Array, ...], ...]:
-    """The system of a hinge in blocks: its stiffness less what the arm beyond takes."""
+    order = jnp.arange(stages)
+    pushed, found = lax.scan(backward, halves(wrench), order, reverse=True)
+    X, negative, compliance = found
 
-    def less(block: Array, i: int, j: int) -> Array:
-        return block - w * columns(twice[i], 3 * j, 3 * j + 3)
+    def forward(z: Array, hinge: tuple) -> tuple[Array, Array]:
+        X, stage = hinge
+        link, w = at_stage((hinges.link, hinges.width), stage)
+        others = jnp.pad(columns(X, 6, width), [(0, 0), (6, 0), (0, 0)])
+        return behind(z, link, w, columns(X, 0, 6), others)
 
-    bending = less(stiff[0], 0, 0)
-    if len(stiff) == 1:
-        return ((bending,),)
-    _, mixed, linear = stiff
-    below = once(less(transpose(mixed), 1, 0))
-    return (bending, less(mixed, 0, 1)), (below, less(linear, 1, 1))
+    moved, strain = lax.scan(forward, motion, (X, order))
+    moved = jnp.concatenate([moved, strain.reshape(-1, width, steps)])
+    negative = jnp.sum(negative, axis=0, dtype=jnp.int32)
+    return moved, jnp.concatenate(pushed), negative, compliance[0]
 
 
-def _half(wrench: Array) -> Array:
-    r"""$\tfrac12 A$ of a wrench (6)."""
-    m, n = (-0.5 * skew(rows(wrench, i, i + 3)) for i in (0, 3))
-    return _blocks(m, n, n, jnp.zeros_like(m))
+def _without_wrench(x: Array) -> Array:
+    """The columns of the motion and of the right sides."""
+    return jnp.concatenate([columns(x, 0, 6), columns(x, 12, x.shape[1])], axis=1)
 
 
-def _solved(
-    D: tuple[tuple[Array, ...], ...], right: tuple[Array, ...], R: Array, free: tuple[int, ...]
-) -> tuple[tuple[Array, ...], Array, Array]:
-    """Solution of the system of a hinge, in blocks, for the free strains of a section with the
-    rotation R, zero for the others, the number of negative eigenvalues of D, and the inverse of its
-    bending block."""
-    bent, stretched = tuple(i for i in free if i < 3), tuple(i - 3 for i in free if i > 2)
-    if not stretched:
-        compliance, negative = _inverse(D[0][0], R, bent)
-        return (matmul(compliance, right[0]),), negative, compliance
-    (a, b), (below, d) = D
-    flexibility, first = _inverse(d, R, stretched)
-    across = matmul(b, flexibility)
-    compliance, second = _inverse(a - _product(across, below), R, bent)
-    bending = matmul(compliance, once(right[0] - _product(across, right[1])))
-    stretch = matmul(flexibility, once(right[1] - _product(below, bending)))
-    return (bending, stretch), first + second, compliance
+def _joined(L: Array, U: Array, moved: Array, pushed: Array, by_wrench: Array) -> tuple[Array, ...]:
+    """All steps joined: the motions z at their starts, y and the wrenches beyond their ends (6,
+    sides, steps), the numbers of negative pivots, and the changes of the moments at their starts by
+    the rotations there.
+
+    **Arguments:** of all steps (6, columns, steps): L, U, (T, f), (S, s) and G.
+    """
+    width = moved.shape[1]
+    given = jnp.concatenate([L, moved], axis=1), U, pushed, by_wrench
+
+    def backward(beyond: Array, step: tuple) -> tuple[Array, tuple]:
+        ahead, U, pushed, G = step
+        Q, q = columns(beyond, 0, 6), columns(beyond, 6, width)
+        change = once(product(Q, ahead) + jnp.pad(q, [(0, 0), (12, 0)]))
+        by_slide, W = columns(change, 0, 6), columns(change, 6, 6 + width)
+        reduced = matmul(U, change)
+        y, negative = _solved_for(columns(reduced, 0, 6), columns(reduced, 6, 6 + width))
+        W = once(W + product(by_slide, y))
+        start = once(pushed + product(G, W))
+        return start, (y, W, negative, columns(rows(start, 0, 3), 0, 3))
+
+    none = jnp.zeros(moved.shape[:2], moved.dtype)
+    steps = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), given)
+    _, (y, W, negative, Q) = lax.scan(backward, none, steps, reverse=True)
+    y, W, Q = (jnp.moveaxis(x, 0, -1) for x in (y, W, Q))
+    ends = once(moved + product(L, y))
+
+    def forward(z: Array, end: Array) -> tuple[Array, Array]:
+        return _value(end, z), z
+
+    _, z = lax.scan(forward, columns(none, 6, width), jnp.moveaxis(ends, -1, 0))
+    z = jnp.moveaxis(z, 0, -1)
+    return z, _value(y, z), _value(W, z), negative, Q
 
 
-def _inverse(matrix: Array, R: Array, places: tuple[int, ...]) -> tuple[Array, Array]:
-    """Inverse for the free strains among three of the section, and its negative eigenvalues."""
-    matrix = once(matrix)
-    if len(places) == 3:
-        return inverse_block(matrix, places)
-    inverse, negative = inverse_block(_seen_from(transpose(R), matrix), places)
-    return _seen_from(R, inverse), negative
+def _value(by_motion: Array, z: Array) -> Array:
+    """What a motion and the right sides cause, from a map with the columns of both."""
+    return once(product(columns(by_motion, 0, 6), z) + columns(by_motion, 6, by_motion.shape[1]))
 
 
-def _seen_from(R: Array, matrix: Array) -> Array:
-    r"""$R M R^T$."""
-    return matmul(matmul(R, matrix), transpose(R))
+def _solved_for(by_itself: Array, right: Array) -> tuple[Array, Array]:
+    """Solution y of $y = A y + b$, and the negative eigenvalues of 1 - A."""
+    rest = jnp.eye(6, dtype=right.dtype) - by_itself
+    (a, b), (d, e) = ((columns(half, 0, 3), columns(half, 3, 6)) for half in halves(rest))
+    y, negative, _ = solved(((a, b), (d, e)), halves(right), a, ALL)
+    return jnp.concatenate(y), negative
 
 
-def _before_link(beyond: tuple[Array, Array], lever: Array) -> tuple[Array, Array]:
-    """What acts at the end of a link by the motion there, its moments and forces (3, 7, ...), at
-    its start."""
-    moment, force = beyond
-    moment = once(moment + _product(columns(lever, 0, 3), force))
-    moved, pushed = (once(x - _product(columns(x, 3, 6), lever)) for x in (moment, force))
-    return moved, pushed
+def _factors(F: Array) -> tuple[Array, Array, Array]:
+    """L and U of the first six rows of matrices (6 and more, 6, steps), with pivots shared between
+    both evenly, where L has all rows, and what is left, F - L U: rounding, but for a step without
+    length, whose strains turn nothing."""
+    smallest = _SINGULAR * float(jnp.finfo(F.dtype).eps) * jnp.abs(jnp.einsum("ii...->i...", F[:6]))
 
+    def eliminate(i: Array, state: tuple) -> tuple[Array, Array, Array]:
+        F, L, U = state
+        row, column = (lax.dynamic_index_in_dim(F, i, axis, keepdims=False) for axis in (0, 1))
+        pivot = lax.dynamic_index_in_dim(row, i, 0, keepdims=False)
+        size = jnp.abs(pivot)
+        regular = size > lax.dynamic_index_in_dim(smallest, i, 0, keepdims=False)
+        root = jnp.where(regular, lax.rsqrt(jnp.where(regular, size, 1.0)), 0.0)
+        column, row = root * column, jnp.sign(pivot) * root * row
+        return once(F - column[:, None] * row), L.at[:, i].set(column), U.at[i].set(row)
 
-def _carried(beyond: Array, link: Array) -> Array:
-    """As `_before_link`, of derivatives (6, 6, ...) alone."""
-    d = skew(link)
-    above, below = rows(beyond, 0, 3), rows(beyond, 3, 6)
-    beyond = jnp.concatenate([above + matmul(d, below), below])
-    turning = columns(beyond, 0, 3) - matmul(columns(beyond, 3, 6), d)
-    return jnp.concatenate([turning, columns(beyond, 3, 6)], axis=1)
-
-
-def _product(a: Array, b: Array) -> Array:
-    """Product of matrices, to be part of a sum."""
-    return total(a[:, :, None] * b[None], 1)
-
-
-def _halves(x: Array) -> tuple[Array, Array]:
-    """The rows of moments and those of forces."""
-    return rows(x, 0, 3), rows(x, 3, 6)
-
-
-def _beside(matrix: Array, column: Array) -> Array:
-    """A matrix with a column more."""
-    return jnp.concatenate([matrix, column[:, None]], axis=1)
-
-
-def _blocks(a: Array, b: Array, below: Array, d: Array) -> Array:
-    """Matrix (6, 6, ...) of four blocks."""
-    top, bottom = jnp.concatenate([a, b], axis=1), jnp.concatenate([below, d], axis=1)
-    return jnp.concatenate([top, bottom])
+    state = F, jnp.zeros_like(F), jnp.zeros_like(F[:6])
+    left, L, U = lax.fori_loop(0, 6, eliminate, state)
+    return L, U, left

@@ -1,0 +1,290 @@
+r"""The hinges of `pose_elimination`: the arm under loads that depend on positions, and the
+elimination of one hinge.
+
+Each node represents a cell of its weight w, integrated by the midpoint rule: the arm is a chain of
+hinges at the nodes, which turn by $w\kappa$ and slide by $w\upsilon$, with stiff links between
+them. All is in the world's axes and, at each hinge, about its point. The motion
+of the arm beyond a hinge is $z = (\theta, \rho)$, rotation and displacement; the change of the
+wrench there, as seen by the moving section, is $Q z + q$. With the wrench $W = (m, n)$ and
+
+$$A = \begin{pmatrix} -\tilde m & -\tilde n \\ -\tilde n & 0 \end{pmatrix}, \quad
+\hat Q = Q + \tfrac12 A,$$
+
+$\hat Q$ is symmetric where the loads have a potential. It is the stiffness of the arm beyond,
+springs included, so that a stiff spring is eliminated exactly. A hinge with the strain $\delta\xi =
+(\kappa, \upsilon)$ and the motion z before it has
+
+$$(H + H_w - w \hat Q) \, \delta\xi = (\hat Q - \tfrac12 A) z + q + b$$
+
+and before it is $\hat Q z + q + w (\hat Q + \tfrac12 A) \, \delta\xi$. A cell bends evenly, and
+not at a hinge: by the midpoint rule this adds $H_w = \tfrac{w^2}8 (\tilde u \tilde n + \tilde n
+\tilde u)$ to the bending stiffness, with the axis u; without it an arm that buckles seems too soft.
+A link of the vector d moves what is beyond it by $\rho + \theta \times d$. Loads between two nodes
+act at the end of the first cell: one with the wrench (c, f) and the derivative K by the motion
+there adds
+
+$$K + \tfrac12 \begin{pmatrix} \tilde c & -\tilde f \\ \tilde f & 0 \end{pmatrix}.$$
+
+A contact acts inside a cell. Behind the part $\alpha$ of it the arm has moved by $z + \alpha w
+\delta\xi$, about the node; with the derivative K and a given change p of the wrench there, the
+hinge has $H + H_w - w (\hat Q + \alpha^2 K)$ and $(\hat Q - \tfrac12 A + \alpha K) z + q + \alpha p
++ b$, and before it is $(\hat Q + K) z + q + p + w (\hat Q + \tfrac12 A + \alpha K) \, \delta\xi$.
+Contacts on neighbouring steps are so near to each other that the compliance of their own cells
+decides on their forces.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+from ..numerics.component import Matrix
+from ..numerics.once import once
+from ..numerics.quadrature import Grid
+from ..numerics.stacked import columns, cross, matmul, rows, skew, total, transpose
+from .elimination_nodes import at_last_nodes, block_of, inverse_block, jumps, whole
+from .reaction import Reaction, Slopes
+
+
+class Hinge(NamedTuple):
+    r"""The hinge at a node, of size 3 if only bending and twist are free, else 6, and the loads at
+    the end of its cell. All that the passes need is prepared for all hinges at once.
+
+    The first six columns belong to the motion, the last to the right sides; those between them, if
+    there are any, to other unknowns of the passes, zero here.
+
+    - `width` w; `link`: vector d to the end of the cell; `rotation` of the section.
+    - `lever`: $(\tilde d, 0)$, shape (3, columns).
+    - `stiff`: $H + H_w$ in blocks (3, 3): of bending and, of size 6, of bending with linear strains
+      and of these.
+    - `given`: $(-\tfrac12 A, b)$, shape (6, columns).
+    - `load`: derivative by the motion at the end of the cell of the loads there, shape (6,
+      columns).
+    - `flexible`: 1, or 0 where the section is rigid; None without rigid pieces.
+    - `inside`: as `load`, of what acts in the cell, about the node, and the part of the cell before
+      it; None if nothing does.
+    """
+
+    width: Array
+    link: Array
+    rotation: Array
+    lever: Array
+    stiff: tuple[Array, ...]
+    given: Array
+    load: Array
+    flexible: Array | None
+    inside: tuple[Array, Array] | None
+
+
+def hinges_of(
+    H: Matrix,
+    right: Array,
+    along: Reaction,
+    slopes: Slopes,
+    grid: Grid,
+    free: tuple[int, ...],
+    flexible: Array | None,
+    push: Array | None,
+    unknowns: int,
+) -> Hinge:
+    """All hinges, in the last axes (stages, steps, *arms).
+
+    **Arguments:** `right`, `push`: right sides (6, sides, stages, steps, *arms), `push` in the
+    world frame; `unknowns`: number of columns between those of motions and those of right sides.
+    """
+    shape, sides = right.shape[2:], right.shape[1]
+    all_of, after = partial(whole, shape=shape), partial(_after, axes=len(shape))
+    R, w, wrench = all_of(along.rotation), all_of(grid.weight), once(all_of(along.world))
+    m, n = rows(wrench, 0, 3), rows(wrench, 3, 6)
+    reach = once(0.5 * w * all_of(along.axis))  # from the node to the end of its cell
+    moment = once(cross(reach, n))
+    load = once(jnp.concatenate([m - moment - after(m + moment), n - after(n)]))
+    jump = jumps(slopes, grid)
+    if jump is not None:
+        jump = all_of(at_last_nodes(jump, grid.X.shape[0]))
+    if slopes.density is not None:
+        density = 0.5 * w * all_of(slopes.density)
+        density = _carried(density, -reach) + _carried(after(density), after(reach))
+        jump = density if jump is None else jump + density
+    b = once(jnp.concatenate([matmul(R, part) for part in halves(right)]))
+    stiff = _seen_from(R, block_of(H, 0, 0, shape))
+    even = matmul(skew(reach), skew(n))
+    stiff = [once(stiff + 0.25 * w * (even + transpose(even)))]
+    if max(free) > 2:
+        stiff += [_seen_from(R, block_of(H, i, 3, shape)) for i in (0, 3)]
+    load = _half(load)
+    load = _blocks(-load[:3, :3], load[:3, 3:], -load[3:, :3], load[3:, 3:])
+    load = load if jump is None else load + jump
+    inside = None
+    if slopes.cells is not None and slopes.part is not None:
+        cells = all_of(slopes.cells)
+        cells = _wider(cells, unknowns + sides) if push is None else _beside(cells, push, unknowns)
+        inside = cells, all_of(slopes.part)
+    load, given = _wider(load, unknowns + sides), _beside(-_half(wrench), b, unknowns)
+    lever = _wider(skew(reach), 3 + unknowns + sides)
+    flexible = None if flexible is None else all_of(flexible)
+    return Hinge(w, reach, R, lever, tuple(stiff), given, load, flexible, inside)
+
+
+def _after(x: Array, axes: int) -> Array:
+    """Values at the next nodes, zero beyond the tip, with so many axes (stages, steps, *arms)."""
+    stage = x.ndim - axes
+    others = lax.slice_in_dim(x, 1, None, axis=stage)
+    later = lax.slice_in_dim(lax.slice_in_dim(x, 0, 1, axis=stage), 1, None, axis=stage + 1)
+    room = [(0, 0)] * x.ndim
+    room[stage + 1] = (0, 1)
+    return jnp.concatenate([others, jnp.pad(later, room)], axis=stage)
+
+
+def before(
+    free: tuple[int, ...], end: tuple[Array, Array], hinge: Hinge
+) -> tuple[tuple[Array, Array], tuple[Array, ...]]:
+    r"""One cell: from $\hat Q$ and q beyond its end to those at its start, the moments (3, columns)
+    and the forces; the strain by the motion of the section before the hinge and by the other
+    columns (size, columns), the number of negative pivots, the compliance of bending, and the
+    change of the moment beyond by the rotation (3, 3).
+
+    Moments and forces are apart, since XLA does not fuse what joins arrays."""
+    w = hinge.width
+    load, given = (halves(x) for x in (hinge.load, hinge.given))
+    beyond = _before_link((end[0] + load[0], end[1] + load[1]), hinge.lever)
+    # what a strain and a motion before the hinge do, and a strain to itself
+    bent = twice = whole_cell = beyond
+    if hinge.inside is not None:
+        inside, part = halves(hinge.inside[0]), hinge.inside[1]
+        bent = tuple(x + part * y for x, y in zip(beyond, inside, strict=True))
+        twice = tuple(x + part**2 * y for x, y in zip(beyond, inside, strict=True))
+        whole_cell = tuple(x + y for x, y in zip(beyond, inside, strict=True))
+    right = tuple(once(x + y) for x, y in zip(bent, given, strict=True))
+    D = _pivot(hinge.stiff, w, twice)
+    X, negative, compliance = solved(D, right, hinge.rotation, free)
+    if hinge.flexible is not None:
+        bends = hinge.flexible > 0
+        X = tuple(jnp.where(bends, x, 0.0) for x in X)
+        compliance = jnp.where(bends, compliance, 0.0)
+        negative = jnp.where(bends, negative, 0)
+    start = []
+    for Q, held, half in zip(bent, whole_cell, given, strict=True):
+        turning = once(w * columns(Q - half, 0, 3 * len(X)))
+        parts = [product(columns(turning, 3 * i, 3 * i + 3), x) for i, x in enumerate(X)]
+        start.append(once(sum(parts, held)))
+    start = _before_link((start[0], start[1]), hinge.lever)
+    Q = columns(beyond[0], 0, 3)
+    return (start[0], start[1]), (jnp.concatenate(X), negative, compliance, Q)
+
+
+def behind(
+    motion: Array, link: Array, width: Array, X: Array, others: Array
+) -> tuple[Array, Array]:
+    r"""The motions at the end of a cell and its strains, from the motions (6, n) at its start, X
+    (size, 6) and `others` (size, n): $X z + x$, with the motion z before the hinge."""
+    link = link[:, None]
+    turn, shift = rows(motion, 0, 3), rows(motion, 3, 6)
+    here = once(jnp.concatenate([turn, shift + cross(turn, link)]))
+    strain = once(product(X, here) + others)
+    bent = width * rows(strain, 0, 3)
+    shift = shift + cross(2.0 * turn + bent, link)
+    if len(strain) == 6:
+        shift = shift + width * rows(strain, 3, 6)
+    return once(jnp.concatenate([turn + bent, shift])), strain
+
+
+def _pivot(
+    stiff: tuple[Array, ...], w: Array, twice: tuple[Array, ...]
+) -> tuple[tuple[Array, ...], ...]:
+    """The system of a hinge in blocks: its stiffness less what the arm beyond takes."""
+
+    def less(block: Array, i: int, j: int) -> Array:
+        return block - w * columns(twice[i], 3 * j, 3 * j + 3)
+
+    bending = less(stiff[0], 0, 0)
+    if len(stiff) == 1:
+        return ((bending,),)
+    _, mixed, linear = stiff
+    below = once(less(transpose(mixed), 1, 0))
+    return (bending, less(mixed, 0, 1)), (below, less(linear, 1, 1))
+
+
+def _half(wrench: Array) -> Array:
+    r"""$\tfrac12 A$ of a wrench (6)."""
+    m, n = (-0.5 * skew(rows(wrench, i, i + 3)) for i in (0, 3))
+    return _blocks(m, n, n, jnp.zeros_like(m))
+
+
+def solved(
+    D: tuple[tuple[Array, ...], ...], right: tuple[Array, ...], R: Array, free: tuple[int, ...]
+) -> tuple[tuple[Array, ...], Array, Array]:
+    """Solution of the system of a hinge, in blocks, for the free strains of a section with the
+    rotation R, zero for the others, the number of negative eigenvalues of D, and the inverse of its
+    bending block."""
+    bent, stretched = tuple(i for i in free if i < 3), tuple(i - 3 for i in free if i > 2)
+    if not stretched:
+        compliance, negative = _inverse(D[0][0], R, bent)
+        return (matmul(compliance, right[0]),), negative, compliance
+    (a, b), (below, d) = D
+    flexibility, first = _inverse(d, R, stretched)
+    across = matmul(b, flexibility)
+    compliance, second = _inverse(a - product(across, below), R, bent)
+    bending = matmul(compliance, once(right[0] - product(across, right[1])))
+    stretch = matmul(flexibility, once(right[1] - product(below, bending)))
+    return (bending, stretch), first + second, compliance
+
+
+def _inverse(matrix: Array, R: Array, places: tuple[int, ...]) -> tuple[Array, Array]:
+    """Inverse for the free strains among three of the section, and its negative eigenvalues."""
+    matrix = once(matrix)
+    if len(places) == 3:
+        return inverse_block(matrix, places)
+    inverse, negative = inverse_block(_seen_from(transpose(R), matrix), places)
+    return _seen_from(R, inverse), negative
+
+
+def _seen_from(R: Array, matrix: Array) -> Array:
+    r"""$R M R^T$."""
+    return matmul(matmul(R, matrix), transpose(R))
+
+
+def _before_link(beyond: tuple[Array, Array], lever: Array) -> tuple[Array, Array]:
+    """What acts at the end of a link by the motion there, its moments and forces (3, 7, ...), at
+    its start."""
+    moment, force = beyond
+    moment = once(moment + product(columns(lever, 0, 3), force))
+    moved, pushed = (once(x - product(columns(x, 3, 6), lever)) for x in (moment, force))
+    return moved, pushed
+
+
+def _carried(beyond: Array, link: Array) -> Array:
+    """As `_before_link`, of derivatives (6, 6, ...) alone."""
+    d = skew(link)
+    above, below = rows(beyond, 0, 3), rows(beyond, 3, 6)
+    beyond = jnp.concatenate([above + matmul(d, below), below])
+    turning = columns(beyond, 0, 3) - matmul(columns(beyond, 3, 6), d)
+    return jnp.concatenate([turning, columns(beyond, 3, 6)], axis=1)
+
+
+def product(a: Array, b: Array) -> Array:
+    """Product of matrices, to be part of a sum."""
+    return total(a[:, :, None] * b[None], 1)
+
+
+def halves(x: Array) -> tuple[Array, Array]:
+    """The rows of moments and those of forces."""
+    return rows(x, 0, 3), rows(x, 3, 6)
+
+
+def _wider(matrix: Array, more: int) -> Array:
+    """A matrix with so many columns of zeros more."""
+    return jnp.pad(matrix, [(0, 0), (0, more), *[(0, 0)] * (matrix.ndim - 2)])
+
+
+def _beside(matrix: Array, sides: Array, between: int) -> Array:
+    """A matrix, so many columns of zeros, and the columns of right sides."""
+    return jnp.concatenate([_wider(matrix, between), sides], axis=1)
+
+
+def _blocks(a: Array, b: Array, below: Array, d: Array) -> Array:
+    """Matrix (6, 6, ...) of four blocks."""
+    top, bottom = jnp.concatenate([a, b], axis=1), jnp.concatenate([below, d], axis=1)
+    return jnp.concatenate([top, bottom])
