@@ -83,7 +83,7 @@ def approximate_solve(
         points = {place: one._replace(wrench=one.direction) for place, one in points.items()}
     pushes = [one.pushes(right.coupled[place]) for place, one in points.items()]
     slopes = None if along is None or loads is None else _slopes(along, loads, points)
-    solve = _elimination(lower, along, slopes, grid, free, flexible)
+    solve = _elimination(lower, along, slopes, grid, free, flexible, apart=apart)
     if along is not None and loads is not None and along.pull is not None:
         chords = along.pull.springs(along.rotation, cut=loads.only_discs)
         solve = with_springs(solve, chords, grid, apart=apart)
@@ -125,6 +125,8 @@ def _elimination(
     grid: Grid,
     free: tuple[int, ...],
     flexible: Array | None,
+    *,
+    apart: bool,
 ) -> Solve:
     """The elimination for several right sides, and what pushes each of them."""
 
@@ -133,7 +135,9 @@ def _elimination(
 
     def solve(b: Vector, *push: Array) -> tuple[Vector, Definiteness]:
         if along is not None and slopes is not None and slopes.motion == 6:
-            return eliminate_poses(lower, b, along, slopes, grid, free, flexible, *push)
+            return eliminate_poses(
+                lower, b, along, slopes, grid, free, flexible, *push, apart=apart
+            )
         if len(b[0]) == 1:
             found, definiteness = one(tuple(x[0] for x in b))
             return tuple(x[None] for x in found), definiteness
