@@ -91,7 +91,7 @@ def jobs() -> list[Job]:
 def compiled(job: Job, size: int, device: Any) -> Timed:
     """The solve of a number of arms on a device."""
     inputs = job.inputs(size)
-    with jax.default_device(device), jax.enable_x64(True):
+    with jax.default_device(device):
         if size == 1:
             return Timed(job.solve, jnp.asarray(inputs[0]))
         return Timed(jax.vmap(job.solve), jnp.asarray(inputs))
