@@ -82,17 +82,17 @@ def places_of(grid: Grid) -> tuple[Array, Array]:
     return jnp.tile(jnp.arange(stages), steps), jnp.repeat(jnp.arange(steps), stages)
 
 
-def at_node(tree: Tree, place: tuple[Array, Array], arms: int) -> Tree:
+def at_node(tree: Tree, place: tuple[Array, ...], arms: int) -> Tree:
     """Values (..., *arms) at the stage and the step of a node, of arrays (..., stages, steps,
-    *arms) with so many axes of arms.
+    *arms) with so many axes of arms; or at a stage of all steps, which take the place of arms.
 
     A pass takes them from where they are: to bring the nodes into its order first would copy the
     arrays."""
-    stage, step = place
 
     def own(x: Array) -> Array:
-        x = lax.dynamic_index_in_dim(x, step, x.ndim - arms - 1, keepdims=False)
-        return once(lax.dynamic_index_in_dim(x, stage, x.ndim - arms - 1, keepdims=False))
+        for index in reversed(place):
+            x = lax.dynamic_index_in_dim(x, index, x.ndim - arms - 1, keepdims=False)
+        return once(x)
 
     return jax.tree.map(own, tree)
 

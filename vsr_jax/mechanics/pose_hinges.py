@@ -43,7 +43,7 @@ from jaxtyping import Array
 from ..numerics.component import Matrix
 from ..numerics.once import once
 from ..numerics.quadrature import Grid
-from ..numerics.stacked import columns, cross, matmul, rows, skew, total, transpose
+from ..numerics.stacked import columns, cross, matmul, product, rows, skew, transpose
 from .elimination_nodes import at_last_nodes, block_of, inverse_block, jumps, whole
 from .reaction import Reaction, Slopes
 
@@ -262,11 +262,6 @@ def _carried(beyond: Array, link: Array) -> Array:
     beyond = jnp.concatenate([above + matmul(d, below), below])
     turning = columns(beyond, 0, 3) - matmul(columns(beyond, 3, 6), d)
     return jnp.concatenate([turning, columns(beyond, 3, 6)], axis=1)
-
-
-def product(a: Array, b: Array) -> Array:
-    """Product of matrices, to be part of a sum."""
-    return total(a[:, :, None] * b[None], 1)
 
 
 def halves(x: Array) -> tuple[Array, Array]:

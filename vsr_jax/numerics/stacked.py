@@ -39,7 +39,12 @@ def components(x: Array) -> tuple[Array, ...]:
 
 def matmul(a: Array, b: Array) -> Array:
     """Product of the matrices (n, k, ...) and (k, m, ...)."""
-    return once(total(a[:, :, None] * b[None], 1))
+    return once(product(a, b))
+
+
+def product(a: Array, b: Array) -> Array:
+    """As `matmul`, to be part of a sum."""
+    return total(a[:, :, None] * b[None], 1)
 
 
 def matvec(a: Array, v: Array) -> Array:
@@ -73,10 +78,10 @@ def cross(a: Array, b: Array) -> Array:
 
 
 def affine(a: Array, v: Array) -> Array:
-    """Value $A v + b$ of an affine function, with $b$ the last column of a matrix (n, k + 1,
-    ...)."""
-    size = a.shape[1] - 1
-    return matvec(columns(a, 0, size), v) + a[:, size]
+    """Values $A v + B$ of affine functions, with B the last columns of a matrix (n, k + m, ...),
+    for v (k, m, ...)."""
+    size = len(v)
+    return once(product(columns(a, 0, size), v) + columns(a, size, a.shape[1]))
 
 
 def transpose(a: Array) -> Array:

@@ -19,6 +19,7 @@ from ..models.basis import AbstractBasis, Basis, Legendre, PiecewiseConstant
 from ..models.continuum import Continuum
 from ..models.prescribed import Prescribed
 from ..models.strain_dependent import StrainDependent
+from ..numerics.compiling import on_cpu
 from ..solution.solver import solve
 from ..solution.step_choice import gradient_error
 from ..typing import cast
@@ -154,7 +155,7 @@ def _shape_program(scene: Scene, inputs: Array, model: Model) -> _ShapeProgram:
             jnp.concatenate([leaf.reshape(3, -1) for leaf in slopes], axis=1),
         )
 
-    options = _QUICK if jax.default_backend() == "cpu" and jax.__version_info__ < (0, 11) else None
+    options = _QUICK if on_cpu() and jax.__version_info__ < (0, 11) else None
     return _ShapeProgram(
         jax.jit(jax.vmap(of)).lower(inputs).compile(compiler_options=options), inputs
     )
