@@ -131,9 +131,10 @@ def test_errors_of_a_quick_program_are_its_own():
 
 def test_quick_options_are_taken_and_leave_what_a_user_has_set(monkeypatch):
     options, level = vsr.quick_compilation, "xla_backend_optimization_level"
+    known = jax.default_backend() == "cpu" and jax.__version_info__ < (0, 11)
     assert jax.jit(lambda x: x + 1, compiler_options=options())(1.0) == 2.0
-    for flags, expected in ((f"--{level}=0", False), ("", jax.default_backend() == "cpu")):
+    for flags, expected in ((f"--{level}=0", False), ("", known)):
         monkeypatch.setenv("XLA_FLAGS", flags)
         assert (level in options()) == expected
     options().clear()
-    assert options() or jax.default_backend() != "cpu", "a user's changes reach the package"
+    assert options() or not known, "a user's changes reach the package"

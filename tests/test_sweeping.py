@@ -454,6 +454,11 @@ def test_what_is_refused(change, message):
         vsr.sweep(arguments.pop("scene"), arguments.pop("inputs"), progress=False, **arguments)
 
 
+simulated = pytest.mark.skipif(
+    jax.default_backend() != "cpu", reason="several devices are simulated on a CPU"
+)
+
+
 def started(code, **environment):
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **environment}
     return subprocess.Popen(
@@ -466,6 +471,7 @@ def finished(process):
     assert process.returncode == 0, said
 
 
+@simulated
 def test_eight_devices_give_the_same(tmp_path, expected):
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=8"
     code = """
@@ -478,6 +484,7 @@ np.save(os.environ["TO"], vsr.sweep(arm(0.006), inputs, model=model, progress=Fa
     )  # another program, rounded otherwise
 
 
+@simulated
 def test_two_processes_give_the_same_in_memory_and_on_disk(tmp_path, expected):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
