@@ -1,6 +1,8 @@
 """Values that are computed once: the same values and derivatives, and the compiler does keep
 them."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,13 +14,14 @@ from vsr_jax.numerics.stacked import total
 SHAPES = [(), (3,), (2, 3, 5)]
 
 
+@pytest.mark.parametrize("summed", [False, True])
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-def test_values_and_derivatives_are_those_without_it(shape, dtype):
+def test_values_and_derivatives_are_those_without_it(shape, dtype, summed):
     x = jnp.asarray(np.random.default_rng(0).normal(size=shape), dtype)
 
     def through(x):
-        return jnp.sum(jnp.sin(once(x * x)))
+        return jnp.sum(jnp.sin(once(x * x, summed=summed)))
 
     def plain(x):
         return jnp.sum(jnp.sin(x * x))
@@ -77,5 +80,5 @@ def fused(step, keep, x):
 def test_the_compiler_fuses_nothing_across_it(step, shape, dtype):
     """It must be noticed if a newer XLA knows how to remove what `once` puts in."""
     x = jnp.ones(shape, dtype)
-    assert fused(step, once, x) == 6
+    assert fused(step, once, x) == fused(step, partial(once, summed=True), x) == 6
     assert fused(step, lambda x: x, x) < 6

@@ -148,7 +148,7 @@ class _Sizes(NamedTuple):
         square = _over_nodes(grid.weight * bent**2) / length
         for coupling, rows in zip(self.problem.couplings, imbalance.coupled, strict=True):
             for size in coupling.row_sizes(rows, at, self.problem):
-                square = square + jnp.mean(size**2, axis=self._inner(size))
+                square = square + jnp.mean(once(size**2, summed=True), axis=self._inner(size))
         return jnp.sqrt(square)
 
     def turn(self, step: ArmUnknown) -> Array:
@@ -179,7 +179,7 @@ class _Sizes(NamedTuple):
 def _over_nodes(x: Array) -> Array:
     """Sum over all nodes. The terms are an array of their own: in the loop of a sum XLA computes
     them one by one, with all that leads to them."""
-    return jnp.sum(once(x), axis=(0, 1))
+    return jnp.sum(once(x, summed=True), axis=(0, 1))
 
 
 def _changes(

@@ -111,10 +111,10 @@ def _slopes(along: Reaction, loads: Loading, points: dict[int, PointForces]) -> 
     slopes, pull = slopes_of(along, loads), along.pull
     if pull is not None and loads.only_discs:
         slopes = slopes._replace(ends=pull.cut_slopes(slopes.motion), joined=pull.joined)
-    if slopes.contacts is None:
+    if along.touch is None:
         return slopes
     (springs,) = points.values()
-    cells, part = springs.slopes(slopes.contacts)
+    cells, part = springs.slopes(along.touch)
     return slopes._replace(cells=cells, part=part)
 
 

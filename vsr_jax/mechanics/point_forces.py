@@ -1,15 +1,17 @@
-"""Forces of a coupling at places of the arm, in the tangent system."""
+"""Forces of a coupling at places of the arm, in the tangent system.
+
+What is joined of blocks is joined at the end, without the axis of the obstacles: XLA chooses the
+block anew for every number of a joined array."""
 
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, PyTree
 
 from ..numerics.once import once
-from ..numerics.stacked import total
+from ..numerics.stacked import columns, rows as rows_of, total
 from .slip import Slip
-from .touch import motions_at, received
+from .touch import Touch, motions_at, received, touch_slopes
 
 
 class PointForces(NamedTuple):
@@ -39,19 +41,27 @@ class PointForces(NamedTuple):
     handed: Array
     slip: Slip | None = None
 
-    def slopes(self, contacts: Array) -> tuple[Array, Array]:
-        """Derivatives (6, 6, stages, steps, ...) of the wrenches by the motions in the cells, with
-        those of given `contacts` (6, 6, obstacles, steps, ...), and the part of each cell (stages,
-        steps, ...) before them: of several the mean, the stiffest first."""
-        stiffness = once(self.factors) / self.corner
-        square = (stiffness * self.wrench)[:, None] * self.direction
-        for place in range(0, square.shape[2], contacts.shape[2]):
-            here = lax.slice_in_dim(square, place, place + contacts.shape[2], axis=2)
-            contacts = contacts - here
-        cell = self.cell[:, : contacts.shape[2]]
+    def slopes(self, touch: Touch) -> tuple[Array, Array]:
+        """Derivatives (6, 6, stages, steps, ...) of the wrenches by the motions in the cells, those
+        of the contacts included, and the part of each cell (stages, steps, ...) before them: of
+        several the mean, the stiffest first."""
+        stiffness, size = once(self.factors) / self.corner, len(touch.gap)
+        cell, push = self.cell[:, :size], once(stiffness * self.wrench)
+
+        def in_cells(block: Array, first: int, second: int) -> Array:
+            wrench = rows_of(push, first, first + 3)
+            direction = rows_of(self.direction, second, second + 3)
+            for place in range(0, wrench.shape[1], size):  # the springs of each direction
+                w, a = (columns(x, place, place + size) for x in (wrench, direction))
+                block = block - w[:, None] * a
+            return total(cell * once(block)[:, :, None], 3)
+
+        by_turn, by_shift, turned, shifted = touch_slopes(touch)
+        moment = jnp.concatenate([in_cells(by_turn, 0, 0), in_cells(by_shift, 0, 3)], axis=1)
+        force = jnp.concatenate([in_cells(turned, 3, 0), in_cells(shifted, 3, 3)], axis=1)
         stiffness, least = self.cell * stiffness, float(jnp.finfo(stiffness.dtype).tiny)
         part = total(stiffness * self.part, 1) / (total(stiffness, 1) + least)
-        return total(cell * once(contacts)[:, :, None], 3), part
+        return jnp.concatenate([moment, force]), part
 
     def pushes(self, rows: PyTree) -> Array:
         """Changes (6, stages, steps, ...) of the wrenches by given rows (n * steps, ...) alone."""

@@ -110,7 +110,7 @@ def motions(strain: Vector, part: Array, along: Reaction, grid: Grid) -> Array:
     moved = cross(2.0 * ends - bent, reach) + slid
     there = summed(moved) - cross(ends, reach)  # behind the hinge at the node
     ahead = 1.0 - part
-    return jnp.concatenate([ends - ahead * bent, there - ahead * slid])
+    return once(jnp.concatenate([ends - ahead * bent, there - ahead * slid]))
 
 
 def _node_by_node(hinges: Hinge, grid: Grid, free: tuple[int, ...]) -> tuple[Array, Array, Array]:

@@ -49,7 +49,7 @@ from ..numerics.stacked import (
 )
 from .chords import Discs, Pull, discs_of, pull_of
 from .pose_terms import PoseTerm, base_of, finite, pose_terms
-from .touch import Surroundings, Touch, contact_wrenches, touch_of, touch_slopes
+from .touch import Surroundings, Touch, contact_wrenches, touch_of
 
 
 class FollowerPoint(NamedTuple):
@@ -174,9 +174,8 @@ class PointSlope(NamedTuple):
 class Slopes(NamedTuple):
     """Derivatives of the loads in the world frame with respect to motions of their sections: of the
     density (6, motion, stages, steps), None if it is constant, of the wrenches at points, of those
-    of chords at the ends of the steps (6, motion, steps), of those of `contacts`, each by the
-    motion there (6, 6, obstacles, steps), and of what acts in the `cells` of the nodes, about
-    these (6, 6, stages, steps), behind a `part` of each (stages, steps).
+    of chords at the ends of the steps (6, motion, steps), and of what acts in the `cells` of the
+    nodes, about these (6, 6, stages, steps), behind a `part` of each (stages, steps).
 
     `joined`: 0 for each step at whose end the arm can be cut, since the wrenches on each side
     depend on the motions of that side relative to the cut; None without cuts."""
@@ -184,7 +183,6 @@ class Slopes(NamedTuple):
     density: Array | None
     points: tuple[PointSlope, ...]
     ends: Array | None
-    contacts: Array | None = None
     cells: Array | None = None
     part: Array | None = None
     joined: Array | None = None
@@ -192,13 +190,7 @@ class Slopes(NamedTuple):
     @property
     def motion(self) -> int:
         """Size of the motions, see `Loading.motion`."""
-        every = (
-            self.density,
-            self.ends,
-            self.contacts,
-            self.cells,
-            *(p.matrix for p in self.points),
-        )
+        every = (self.density, self.ends, self.cells, *(p.matrix for p in self.points))
         matrices = [x for x in every if x is not None]
         return matrices[0].shape[1] if matrices else 0
 
@@ -362,8 +354,7 @@ def slopes_of(along: Reaction, loads: Loading) -> Slopes:
         else:
             density = here if density is None else density + here
     ends = None if along.pull is None else along.pull.slopes(size)
-    contacts = None if along.touch is None else touch_slopes(along.touch)
-    return Slopes(density, tuple(points), ends, contacts=contacts)
+    return Slopes(density, tuple(points), ends)
 
 
 def _turning(wrench: Array, size: int) -> Array:

@@ -26,6 +26,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..numerics.component import Vector
+from ..numerics.once import once
 from ..numerics.quadrature import Grid, value_weights
 from ..numerics.stacked import components, matvec, stack, total, transpose
 from .reaction import Reaction
@@ -54,14 +55,14 @@ class Sliding(NamedTuple):
         touch = self.touch
         shear = self.compliance * matvec(self.rotation, stack(right[3:]))
         slope = total(self.values * shear[:, :, None], 1)
-        slope = touch.slide * self.h * total(touch.normal * slope, 0)
+        slope = once(touch.slide * self.h * total(touch.normal * slope, 0))
         push = total(touch.cell * (slope * touch.sliding)[:, None], 2)
         return _with_force(right, self._forces(slope)), push
 
     def followed(self, strain: Vector, motions: Array) -> Vector:
         """A change of strain with the shear by motions in the cells."""
         touch = self.touch
-        slope = touch.slide * total(touch.sliding * motions_at(touch.cell, motions), 0)
+        slope = once(touch.slide * total(touch.sliding * motions_at(touch.cell, motions), 0))
         return _with_force(strain, self.compliance * self._forces(slope))
 
     def _forces(self, slope: Array) -> Array:

@@ -42,7 +42,7 @@ from ..arm.obstacles import Obstacle
 from ..arm.rod import Rod
 from ..numerics.once import once
 from ..numerics.quadrature import Grid, gauss_legendre, integral_weights, value_weights
-from ..numerics.stacked import cross, matmul, rows, skew, total
+from ..numerics.stacked import cross, matmul, product, rows, skew, total
 from .nearest import nearest_points
 from .pose_terms import starts_of
 from .slip import Rough, Slip, slip_of
@@ -236,16 +236,21 @@ def motions_at(cell: Array, motions: Array) -> Array:
     return total(cell * motions[:, :, None], 1)
 
 
-def touch_slopes(touch: Touch) -> Array:
-    """Derivatives (6, 6, obstacles, steps, *arms) of the contact wrenches by the motions of the
-    arm there, about the nodes of their cells."""
+def touch_slopes(touch: Touch) -> tuple[Array, ...]:
+    """Derivatives of the contact wrenches by the motions of the arm there, about the nodes of their
+    cells, in blocks (3, 3, obstacles, steps, *arms): of moments by rotations and displacements,
+    then of forces."""
     d = skew(touch.lever)
-    moved = once(touch.sliding)
+    turning, force = (once(x) for x in (rows(touch.sliding, 0, 3), rows(touch.sliding, 3, 6)))
     above, below = matmul(d, touch.bend), matmul(touch.bend, d)
-    corner = matmul(skew(touch.push) - above, d)
-    top = jnp.concatenate([corner, above], axis=1)
-    bent = jnp.concatenate([top, jnp.concatenate([-below, touch.bend], axis=1)])
-    return bent + (touch.slide * moved)[:, None] * moved
+    corner = product(skew(touch.push) - above, d)
+    slid = touch.slide
+    return (
+        corner + (slid * turning)[:, None] * turning,
+        above + (slid * turning)[:, None] * force,
+        (slid * force)[:, None] * turning - below,
+        touch.bend + (slid * force)[:, None] * force,
+    )
 
 
 def _cell_of(sigma: Array, stages: int) -> tuple[Array, Array]:

@@ -16,12 +16,18 @@ from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
 
-def once(x: Array) -> Array:
+def once(x: Array, *, summed: bool = False) -> Array:
     """The same values, computed once on a CPU; of finite floats, in double precision infinite ones
     too, and of truth values. Derivatives of both modes are computed once too. Other devices take
     the values as they are: there a batch in contact takes a third longer with an operation more
-    for each."""
-    return _once.bind(x.astype(jnp.float32)) > 0 if x.dtype == bool else _once.bind(x)
+    for each.
+
+    **Arguments:** `summed`: for terms of a sum. XLA hands sums to a library, divisions that lead to
+    them too, which then takes ten times as long.
+    """
+    if x.dtype == bool:
+        return _once.bind(x.astype(jnp.float32), summed=False) > 0
+    return _once.bind(x, summed=summed)
 
 
 def _divided(x: Array) -> Array:
@@ -41,18 +47,18 @@ def _gathered(x: Array) -> Array:
     return rows.at[jnp.arange(len(rows))].get(mode="promise_in_bounds").reshape(x.shape)
 
 
-def _kept(x: Array) -> Array:
+def _kept(x: Array, *, summed: bool) -> Array:
     """The cheapest: a division in double precision takes longer than a gather. Of one row, XLA sees
     that a gather changes nothing."""
-    if x.dtype != jnp.float64:
+    if x.dtype != jnp.float64 and not (summed and math.prod(x.shape[:-1]) > 1):
         return _divided(x)
     return _gathered(x) if math.prod(x.shape[:-1]) > 1 else _clamped(x)
 
 
 _once = Primitive("once")
-_once.def_impl(lambda x: x)
-_once.def_abstract_eval(lambda x: x)
-ad.deflinear2(_once, lambda cotangent, _: [once(cotangent)])
+_once.def_impl(lambda x, **_: x)
+_once.def_abstract_eval(lambda x, **_: x)
+ad.deflinear2(_once, lambda cotangent, _, **how: [_once.bind(cotangent, **how)])
 batching.defvectorized(_once)
-mlir.register_lowering(_once, mlir.lower_fun(lambda x: x, multiple_results=False))
+mlir.register_lowering(_once, mlir.lower_fun(lambda x, **_: x, multiple_results=False))
 mlir.register_lowering(_once, mlir.lower_fun(_kept, multiple_results=False), platform="cpu")
