@@ -19,11 +19,12 @@ $$(H + H_w - w \hat Q) \, \delta\xi = (\hat Q - \tfrac12 A) z + q + b$$
 and before it is $\hat Q z + q + w (\hat Q + \tfrac12 A) \, \delta\xi$. A cell bends evenly, and
 not at a hinge: by the midpoint rule this adds $H_w = \tfrac{w^2}8 (\tilde u \tilde n + \tilde n
 \tilde u)$ to the bending stiffness, with the axis u; without it an arm that buckles seems too soft.
-A link of the vector d moves what is beyond it by $\rho + \theta \times d$. Loads between two nodes
-act at the end of the first cell: one with the wrench (c, f) and the derivative K by the motion
-there adds
+A link of the vector d to the next hinge moves what is beyond it by $\rho + \theta \times d$. Loads
+between two nodes act on the link, at the end of the first cell, the vector r from its node: those
+with the wrench (c, f) and the derivative K by the motion, both about the node, add
 
-$$K + \tfrac12 \begin{pmatrix} \tilde c & -\tilde f \\ \tilde f & 0 \end{pmatrix}.$$
+$$K + \begin{pmatrix} \tilde f \tilde r & 0 \\ 0 & 0 \end{pmatrix} +
+\tfrac12 \begin{pmatrix} \tilde c & -\tilde f \\ \tilde f & 0 \end{pmatrix}.$$
 
 A contact acts inside a cell. Behind the part $\alpha$ of it the arm has moved by $z + \alpha w
 \delta\xi$, about the node; with the derivative K and a given change p of the wrench there, the
@@ -49,22 +50,21 @@ from .reaction import Reaction, Slopes
 
 
 class Hinge(NamedTuple):
-    r"""The hinge at a node, of size 3 if only bending and twist are free, else 6, and the loads at
-    the end of its cell. All that the passes need is prepared for all hinges at once.
+    r"""The hinge at a node, of size 3 if only bending and twist are free, else 6, the link to the
+    next one, and the loads on it. All that the passes need is prepared for all hinges at once.
 
     The first six columns belong to the motion, the last to the right sides; those between them, if
     there are any, to other unknowns of the passes, zero here.
 
-    - `width` w; `link`: vector d to the end of the cell; `rotation` of the section.
+    - `width` w; `link`: vector d to the next hinge, zero for the last; `rotation` of the section.
     - `lever`: $(\tilde d, 0)$, shape (3, columns).
     - `stiff`: $H + H_w$ in blocks (3, 3): of bending and, of size 6, of bending with linear strains
       and of these.
     - `given`: $(-\tfrac12 A, b)$, shape (6, columns).
-    - `load`: derivative by the motion at the end of the cell of the loads there, shape (6,
-      columns).
+    - `load`: derivative of the loads on the link by its motion, shape (6, columns).
     - `flexible`: 1, or 0 where the section is rigid; None without rigid pieces.
-    - `inside`: as `load`, of what acts in the cell, about the node, and the part of the cell before
-      it; None if nothing does.
+    - `inside`: as `load`, of what acts in the cell, and the part of the cell before it; None if
+      nothing does.
     """
 
     width: Array
@@ -99,14 +99,16 @@ def hinges_of(
     R, w, wrench = all_of(along.rotation), all_of(grid.weight), once(all_of(along.world))
     m, n = rows(wrench, 0, 3), rows(wrench, 3, 6)
     reach = once(0.5 * w * all_of(along.axis))  # from the node to the end of its cell
-    moment = once(cross(reach, n))
-    load = once(jnp.concatenate([m - moment - after(m + moment), n - after(n)]))
+    link, later = once(reach + after(reach)), once(after(wrench))
+    force = rows(later, 3, 6)
+    load = once(jnp.concatenate([m - rows(later, 0, 3) - cross(link, force), n - force]))
     jump = jumps(slopes, grid)
     if jump is not None:
-        jump = all_of(at_last_nodes(jump, grid.X.shape[0]))
+        jump = jnp.broadcast_to(jump, (*jump.shape[:2], *shape[1:]))
+        jump = at_last_nodes(_carried(jump, reach[:, -1]), shape[0])
     if slopes.density is not None:
         density = 0.5 * w * all_of(slopes.density)
-        density = _carried(density, -reach) + _carried(after(density), after(reach))
+        density = density + _carried(after(density), link)
         jump = density if jump is None else jump + density
     b = once(jnp.concatenate([matmul(R, part) for part in halves(right)]))
     stiff = _seen_from(R, block_of(H, 0, 0, shape))
@@ -114,8 +116,9 @@ def hinges_of(
     stiff = [once(stiff + 0.25 * w * (even + transpose(even)))]
     if max(free) > 2:
         stiff += [_seen_from(R, block_of(H, i, 3, shape)) for i in (0, 3)]
+    moved = matmul(skew(rows(load, 3, 6)), skew(reach))
     load = _half(load)
-    load = _blocks(-load[:3, :3], load[:3, 3:], -load[3:, :3], load[3:, 3:])
+    load = _blocks(moved - load[:3, :3], load[:3, 3:], -load[3:, :3], load[3:, 3:])
     load = load if jump is None else load + jump
     inside = None
     if slopes.cells is not None and slopes.part is not None:
@@ -123,9 +126,9 @@ def hinges_of(
         cells = _wider(cells, unknowns + sides) if push is None else _beside(cells, push, unknowns)
         inside = cells, all_of(slopes.part)
     load, given = _wider(load, unknowns + sides), _beside(-_half(wrench), b, unknowns)
-    lever = _wider(skew(reach), 3 + unknowns + sides)
+    lever = _wider(skew(link), 3 + unknowns + sides)
     flexible = None if flexible is None else all_of(flexible)
-    return Hinge(w, reach, R, lever, tuple(stiff), given, load, flexible, inside)
+    return Hinge(w, link, R, lever, tuple(stiff), given, load, flexible, inside)
 
 
 def _after(x: Array, axes: int) -> Array:
@@ -141,15 +144,16 @@ def _after(x: Array, axes: int) -> Array:
 def before(
     free: tuple[int, ...], end: tuple[Array, Array], hinge: Hinge
 ) -> tuple[tuple[Array, Array], tuple[Array, ...]]:
-    r"""One cell: from $\hat Q$ and q beyond its end to those at its start, the moments (3, columns)
-    and the forces; the strain by the motion of the section before the hinge and by the other
-    columns (size, columns), the number of negative pivots, the compliance of bending, and the
+    r"""One hinge: from $\hat Q$ and q before the next one to those before it, the moments (3,
+    columns) and the forces; the strain by the motion of the section before the hinge and by the
+    other columns (size, columns), the number of negative pivots, the compliance of bending, and the
     change of the moment beyond by the rotation (3, 3).
 
     Moments and forces are apart, since XLA does not fuse what joins arrays."""
     w = hinge.width
     load, given = (halves(x) for x in (hinge.load, hinge.given))
-    beyond = _before_link((end[0] + load[0], end[1] + load[1]), hinge.lever)
+    linked = _before_link(end, hinge.lever)
+    beyond = linked[0] + load[0], linked[1] + load[1]
     # what a strain and a motion before the hinge do, and a strain to itself
     bent = twice = whole_cell = beyond
     if hinge.inside is not None:
@@ -170,7 +174,6 @@ def before(
         turning = once(w * columns(Q - half, 0, 3 * len(X)))
         parts = [product(columns(turning, 3 * i, 3 * i + 3), x) for i, x in enumerate(X)]
         start.append(once(sum(parts, held)))
-    start = _before_link((start[0], start[1]), hinge.lever)
     Q = columns(beyond[0], 0, 3)
     return (start[0], start[1]), (jnp.concatenate(X), negative, compliance, Q)
 
@@ -178,17 +181,14 @@ def before(
 def behind(
     motion: Array, link: Array, width: Array, X: Array, others: Array
 ) -> tuple[Array, Array]:
-    r"""The motions at the end of a cell and its strains, from the motions (6, n) at its start, X
-    (size, 6) and `others` (size, n): $X z + x$, with the motion z before the hinge."""
-    link = link[:, None]
-    turn, shift = rows(motion, 0, 3), rows(motion, 3, 6)
-    here = once(jnp.concatenate([turn, shift + cross(turn, link)]))
-    strain = once(product(X, here) + others)
-    bent = width * rows(strain, 0, 3)
-    shift = shift + cross(2.0 * turn + bent, link)
+    r"""The motions before the next hinge and the strains of one, from the motions (6, n) before it,
+    X (size, 6) and `others` (size, n): $X z + x$, with the motion z before the hinge."""
+    strain = once(product(X, motion) + others)
+    turn = once(rows(motion, 0, 3) + width * rows(strain, 0, 3))
+    shift = rows(motion, 3, 6) + cross(turn, link[:, None])
     if len(strain) == 6:
         shift = shift + width * rows(strain, 3, 6)
-    return once(jnp.concatenate([turn + bent, shift])), strain
+    return once(jnp.concatenate([turn, shift])), strain
 
 
 def _pivot(
