@@ -95,31 +95,17 @@ def hinges_of(
     world frame; `unknowns`: number of columns between those of motions and those of right sides.
     """
     shape, sides = right.shape[2:], right.shape[1]
-    all_of, after = partial(whole, shape=shape), partial(_after, axes=len(shape))
+    all_of = partial(whole, shape=shape)
     R, w, wrench = all_of(along.rotation), all_of(grid.weight), once(all_of(along.world))
-    m, n = rows(wrench, 0, 3), rows(wrench, 3, 6)
     reach = once(0.5 * w * all_of(along.axis))  # from the node to the end of its cell
-    link, later = once(reach + after(reach)), once(after(wrench))
-    force = rows(later, 3, 6)
-    load = once(jnp.concatenate([m - rows(later, 0, 3) - cross(link, force), n - force]))
-    jump = jumps(slopes, grid)
-    if jump is not None:
-        jump = jnp.broadcast_to(jump, (*jump.shape[:2], *shape[1:]))
-        jump = at_last_nodes(_carried(jump, reach[:, -1]), shape[0])
-    if slopes.density is not None:
-        density = 0.5 * w * all_of(slopes.density)
-        density = density + _carried(after(density), link)
-        jump = density if jump is None else jump + density
+    link = once(reach + _after(reach, len(shape)))
+    load = _on_links(wrench, reach, link, slopes, grid)
     b = once(jnp.concatenate([matmul(R, part) for part in halves(right)]))
     stiff = _seen_from(R, block_of(H, 0, 0, shape))
-    even = matmul(skew(reach), skew(n))
+    even = matmul(skew(reach), skew(rows(wrench, 3, 6)))
     stiff = [once(stiff + 0.25 * w * (even + transpose(even)))]
     if max(free) > 2:
         stiff += [_seen_from(R, block_of(H, i, 3, shape)) for i in (0, 3)]
-    moved = matmul(skew(rows(load, 3, 6)), skew(reach))
-    load = _half(load)
-    load = _blocks(moved - load[:3, :3], load[:3, 3:], -load[3:, :3], load[3:, 3:])
-    load = load if jump is None else load + jump
     inside = None
     if slopes.cells is not None and slopes.part is not None:
         cells = all_of(slopes.cells)
@@ -129,6 +115,31 @@ def hinges_of(
     lever = _wider(skew(link), 3 + unknowns + sides)
     flexible = None if flexible is None else all_of(flexible)
     return Hinge(w, link, R, lever, tuple(stiff), given, load, flexible, inside)
+
+
+def _on_links(wrench: Array, reach: Array, link: Array, slopes: Slopes, grid: Grid) -> Array:
+    """Derivatives (6, 6, stages, steps, *arms) of the loads on all links by their motions, about
+    the nodes before them.
+
+    **Arguments:** `wrench` at the nodes; vectors `reach` from these to the ends of their cells and
+    `link` to the next nodes; all of them (..., stages, steps, *arms).
+    """
+    shape = wrench.shape[1:]
+    after = partial(_after, axes=len(shape))
+    later = once(after(wrench))
+    (m, n), (moment, force) = halves(wrench), halves(later)
+    load = once(jnp.concatenate([m - moment - cross(link, force), n - force]))
+    moved = matmul(skew(rows(load, 3, 6)), skew(reach))
+    half = _half(load)
+    load = _blocks(moved - half[:3, :3], half[:3, 3:], -half[3:, :3], half[3:, 3:])
+    jump = jumps(slopes, grid)
+    if jump is not None:
+        jump = jnp.broadcast_to(jump, (*jump.shape[:2], *shape[1:]))
+        load = load + at_last_nodes(_carried(jump, reach[:, -1]), shape[0])
+    if slopes.density is not None:
+        density = 0.5 * whole(grid.weight, shape) * whole(slopes.density, shape)
+        load = load + density + _carried(after(density), link)
+    return load
 
 
 def _after(x: Array, axes: int) -> Array:
