@@ -56,7 +56,7 @@ class Hinge(NamedTuple):
     The first six columns belong to the motion, the last to the right sides; those between them, if
     there are any, to other unknowns of the passes, zero here.
 
-    - `width` w; `link`: vector d to the next hinge, zero for the last; `rotation` of the section.
+    - `width` w; `link`: vector d to the next hinge or the tip; `rotation` of the section.
     - `lever`: $(\tilde d, 0)$, shape (3, columns).
     - `stiff`: $H + H_w$ in blocks (3, 3): of bending and, of size 6, of bending with linear strains
       and of these.
