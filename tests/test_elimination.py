@@ -162,8 +162,9 @@ def test_one_arm_step_by_step_is_a_batch_node_by_node(name):
         return [size * np.sin(3 * x + rng.uniform(0, 6)) for size in sizes]
 
     @jax.jit
-    def solved(unknown, problem, right):
+    def solved(unknown, problem, wrench):
         at = state_of(unknown.xi, unknown.coupled, problem)
+        right = imbalance_of(unknown, at, problem, free)._replace(wrench=wrench)
         return approximate_solve(unknown, at, right, problem, free)
 
     def flat(step):
@@ -174,10 +175,9 @@ def test_one_arm_step_by_step_is_a_batch_node_by_node(name):
         change = smooth([bend] * 3 + [0.01] * 3)
         xi = tuple(r + x for r, x in zip(problem.sections.rest, change, strict=True))
         unknown = ArmUnknown(xi, coupled)
-        rows = imbalance_of(unknown, state_of(xi, coupled, problem), problem, free)
-        right = rows._replace(wrench=tuple(jnp.asarray(x) for x in smooth([1e-3] * len(free))))
-        step, definite, _ = solved(unknown, problem, right)
-        given = jax.tree.map(lambda x: x[..., None], (unknown, problem, right))
+        wrench = tuple(jnp.asarray(x) for x in smooth([1e-3] * len(free)))
+        step, definite, _ = solved(unknown, problem, wrench)
+        given = jax.tree.map(lambda x: x[..., None], (unknown, problem, wrench))
         others, same, _ = solved(*given)
         one, other = flat(step), flat(others)
         # in single precision, but for contacts, whose stiffness takes half of the digits
