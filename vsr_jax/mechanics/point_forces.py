@@ -1,7 +1,8 @@
 """Forces of a coupling at places of the arm, in the tangent system.
 
 What is joined of blocks is joined at the end, without the axis of the obstacles: XLA chooses the
-block anew for every number of a joined array."""
+block again for every number of a joined array.
+"""
 
 from typing import NamedTuple
 
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from ..numerics.once import once
-from ..numerics.stacked import columns, rows as rows_of, total
+from ..numerics.stacked import blocks, columns, rows as rows_of, total
 from .slip import Slip
 from .touch import Touch, motions_at, received, touch_slopes
 
@@ -57,11 +58,15 @@ class PointForces(NamedTuple):
             return total(cell * once(block)[:, :, None], 3)
 
         by_turn, by_shift, turned, shifted = touch_slopes(touch)
-        moment = jnp.concatenate([in_cells(by_turn, 0, 0), in_cells(by_shift, 0, 3)], axis=1)
-        force = jnp.concatenate([in_cells(turned, 3, 0), in_cells(shifted, 3, 3)], axis=1)
+        cells = blocks(
+            in_cells(by_turn, 0, 0),
+            in_cells(by_shift, 0, 3),
+            in_cells(turned, 3, 0),
+            in_cells(shifted, 3, 3),
+        )
         stiffness, least = self.cell * stiffness, float(jnp.finfo(stiffness.dtype).tiny)
         part = total(stiffness * self.part, 1) / (total(stiffness, 1) + least)
-        return jnp.concatenate([moment, force]), part
+        return cells, part
 
     def pushes(self, rows: PyTree) -> Array:
         """Changes (6, stages, steps, ...) of the wrenches by given rows (n * steps, ...) alone."""

@@ -44,7 +44,7 @@ from jaxtyping import Array
 from ..numerics.component import Matrix
 from ..numerics.once import once
 from ..numerics.quadrature import Grid
-from ..numerics.stacked import columns, cross, matmul, product, rows, skew, transpose
+from ..numerics.stacked import blocks, columns, cross, matmul, product, rows, skew, transpose
 from .elimination_nodes import at_last_nodes, block_of, inverse_block, jumps, whole
 from .reaction import Reaction, Slopes
 
@@ -131,7 +131,7 @@ def _on_links(wrench: Array, reach: Array, link: Array, slopes: Slopes, grid: Gr
     load = once(jnp.concatenate([m - moment - cross(link, force), n - force]))
     moved = matmul(skew(rows(load, 3, 6)), skew(reach))
     half = _half(load)
-    load = _blocks(moved - half[:3, :3], half[:3, 3:], -half[3:, :3], half[3:, 3:])
+    load = blocks(moved - half[:3, :3], half[:3, 3:], -half[3:, :3], half[3:, 3:])
     jump = jumps(slopes, grid)
     if jump is not None:
         jump = jnp.broadcast_to(jump, (*jump.shape[:2], *shape[1:]))
@@ -221,7 +221,7 @@ def _pivot(
 def _half(wrench: Array) -> Array:
     r"""$\tfrac12 A$ of a wrench (6)."""
     m, n = (-0.5 * skew(rows(wrench, i, i + 3)) for i in (0, 3))
-    return _blocks(m, n, n, jnp.zeros_like(m))
+    return blocks(m, n, n, jnp.zeros_like(m))
 
 
 def solved(
@@ -288,9 +288,3 @@ def _wider(matrix: Array, more: int) -> Array:
 def _beside(matrix: Array, sides: Array, between: int) -> Array:
     """A matrix, so many columns of zeros, and the columns of right sides."""
     return jnp.concatenate([_wider(matrix, between), sides], axis=1)
-
-
-def _blocks(a: Array, b: Array, below: Array, d: Array) -> Array:
-    """Matrix (6, 6, ...) of four blocks."""
-    top, bottom = jnp.concatenate([a, b], axis=1), jnp.concatenate([below, d], axis=1)
-    return jnp.concatenate([top, bottom])

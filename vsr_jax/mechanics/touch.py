@@ -244,12 +244,12 @@ def touch_slopes(touch: Touch) -> tuple[Array, ...]:
     turning, force = (once(x) for x in (rows(touch.sliding, 0, 3), rows(touch.sliding, 3, 6)))
     above, below = matmul(d, touch.bend), matmul(touch.bend, d)
     corner = product(skew(touch.push) - above, d)
-    slid = touch.slide
+    moment, push = ((touch.slide * x)[:, None] for x in (turning, force))
     return (
-        corner + (slid * turning)[:, None] * turning,
-        above + (slid * turning)[:, None] * force,
-        (slid * force)[:, None] * turning - below,
-        touch.bend + (slid * force)[:, None] * force,
+        corner + moment * turning,
+        above + moment * force,
+        push * turning - below,
+        touch.bend + push * force,
     )
 
 

@@ -18,7 +18,8 @@ F = TypeVar("F", bound=Callable)
 
 def quick_jit(function: F) -> F:
     """`equinox.filter_jit`, with `quick_compilation` where nothing is traced: JAX takes compiler
-    options outside of its transformations only, and batches are traced by `jax.vmap`."""
+    options outside of its transformations only, and batches are traced by `jax.vmap`. `lower` has
+    the options too."""
     plain = eqx.filter_jit(function)
 
     @cache
@@ -37,6 +38,10 @@ def quick_jit(function: F) -> F:
                     raise
         return plain(*args, **kwargs)
 
+    def lower(*args: Any, **kwargs: Any) -> Any:
+        return quick().lower(*args, **kwargs)  # pyright: ignore[reportFunctionMemberAccess]
+
+    call.lower = lower  # pyright: ignore[reportAttributeAccessIssue]
     return cast(F, call)
 
 

@@ -50,9 +50,10 @@ def _gathered(x: Array) -> Array:
 def _kept(x: Array, *, summed: bool) -> Array:
     """The cheapest: a division in double precision takes longer than a gather. Of one row, XLA sees
     that a gather changes nothing."""
-    if x.dtype != jnp.float64 and not (summed and math.prod(x.shape[:-1]) > 1):
+    several = math.prod(x.shape[:-1]) > 1
+    if x.dtype != jnp.float64 and not (summed and several):
         return _divided(x)
-    return _gathered(x) if math.prod(x.shape[:-1]) > 1 else _clamped(x)
+    return _gathered(x) if several else _clamped(x)
 
 
 _once = Primitive("once")

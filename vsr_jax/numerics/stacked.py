@@ -32,6 +32,12 @@ def columns(x: Array, start: int, end: int) -> Array:
     return lax.slice_in_dim(x, start, end, axis=1)
 
 
+def blocks(a: Array, b: Array, below: Array, d: Array) -> Array:
+    """Matrix of four blocks, the first two above the others."""
+    top, bottom = jnp.concatenate([a, b], axis=1), jnp.concatenate([below, d], axis=1)
+    return jnp.concatenate([top, bottom])
+
+
 def components(x: Array) -> tuple[Array, ...]:
     """The components of the first axis, the inverse of `stack`."""
     return tuple(lax.index_in_dim(x, i, keepdims=False) for i in range(x.shape[0]))

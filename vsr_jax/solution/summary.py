@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..arm.discs import on_chords, points_at
-from ..numerics.compiling import quick_compilation, quick_jit
+from ..numerics.compiling import quick_jit
 from ..typing import VectorLike
 from ..validation import choice
 from .quantities import QUANTITIES, AlongArm, Quantity, Solved, abscissas
@@ -81,9 +81,7 @@ def compiled_summary(eq: Solved, X: VectorLike) -> Callable[[Solved], Summary]:
     """The program of `summary_of` at given stations, compiled but not run: for this equilibrium and
     all others of the same model and kind of scene."""
     at = stations(eq, X)
-    options: dict[str, Any] = {"compiler_options": quick_compilation()}
-    jitted: Any = eqx.filter_jit(_table, **options)
-    program = jitted.lower(eq, at, ()).compile()
+    program = _summary.lower(eq, at, ()).compile()  # pyright: ignore[reportFunctionMemberAccess]
     return lambda eq: program(eq, at, ())
 
 
@@ -92,7 +90,8 @@ def _values(eq: Solved, names: tuple[str, ...]) -> dict[str, Any]:
     return {name: eq.value(name) for name in names}
 
 
-def _table(eq: Solved, X: Array, names: tuple[str, ...]) -> Summary:
+@quick_jit
+def _summary(eq: Solved, X: Array, names: tuple[str, ...]) -> Summary:
     along: dict[str, Array] = {}
     for name, entry in QUANTITIES.items():  # an entry `of` another comes after it
         if isinstance(entry, AlongArm):
@@ -111,9 +110,6 @@ def _table(eq: Solved, X: Array, names: tuple[str, ...]) -> Summary:
     for i in eq.scene.straight:
         lines = lines.at[i].set(jnp.where(jnp.isnan(lines[i]), jnp.nan, _chords(eq, i, X)))
     return Summary(X, along, lines, carried[1], _values(eq, names))
-
-
-_summary = quick_jit(_table)
 
 
 def _chords(eq: Solved, place: int, X: Array) -> Array:
