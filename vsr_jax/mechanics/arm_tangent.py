@@ -198,22 +198,24 @@ def tangent_solve(
     _, unravel_change = ravel_pytree(_free_part(unknown, free))
     to_row, to_change = lax.stop_gradient(_units(problem, free, right))
 
-    def nearly(b: ArmImbalance) -> ArmUnknown:
-        step, _, _ = approximate_solve(unknown, at, b, problem, free, apart=True)
-        step = _free_part(cast(step, problem.grid.h.dtype), free)
-        return followed(step, b, lambda step: apply(step).coupled, problem)
+    def nearly(row: ArmImbalance) -> ArmUnknown:
+        step, _, _ = approximate_solve(unknown, at, row, problem, free, apart=True)
+        return _free_part(cast(step, problem.grid.h.dtype), free)
+
+    # all that does not depend on the right side is computed once, before the loop
+    _, nearly = jax.linearize(nearly, jax.tree.map(jnp.zeros_like, right))
+    apply, nearly = jax.jit(apply), jax.jit(nearly)  # each traced once for all its uses
 
     def scaled_apply(x: Array) -> Array:
         return to_row * ravel_pytree(apply(unravel_change(to_change * x)))[0]
 
-    def scaled_nearly(b: Array) -> Array:
-        return ravel_pytree(nearly(unravel_row(b / to_row)))[0] / to_change
+    def scaled_nearly(r: Array) -> Array:
+        row = unravel_row(r / to_row)
+        found = followed(nearly(row), row, lambda step: apply(step).coupled, problem)
+        return ravel_pytree(found)[0] / to_change
 
-    # all that does not depend on the right side is computed once, before the loop
-    b = to_row * flat
-    _, forward = jax.linearize(scaled_nearly, jnp.zeros_like(b))
-    back = jax.linear_transpose(forward, b)
-
+    b, forward = to_row * flat, jax.jit(scaled_nearly)
+    back = jax.jit(jax.linear_transpose(forward, b))
     kept = _KEPT_TOUCHING if problem.softens else _KEPT
 
     def solve(apply: Callable, b: Array) -> Array:
@@ -318,9 +320,9 @@ def _refined(apply: Callable, nearly: Callable, right: Array, kept: int) -> Arra
         directions, images = at.directions.at[place].set(p), at.images.at[place].set(q)
         return _Refinement(x, r, directions, images, taken, refined, at.checking, found)
 
-    none, no = jnp.zeros((kept, *right.shape), right.dtype), jnp.array(False)
-    begin = _Refinement(
-        jnp.zeros_like(right), right, none, none, jnp.zeros((), int), ~(size > 0), no, no
-    )
+    # all of it depends on the right side, so that `jax.vmap` goes over the loop once, not thrice
+    nothing = jnp.where(size > 0, 0, 0)
+    none, no = jnp.zeros((kept, *right.shape), right.dtype) + nothing, nothing > 0
+    begin = _Refinement(none[0], right, none, none, nothing, ~(size > 0), no, no)
     end = lax.while_loop(lambda at: ~at.done, advance, begin)
     return jnp.where(end.found, end.x, jnp.nan)  # no derivative rather than a wrong one
