@@ -102,12 +102,27 @@ def test_command_rejects_an_empty_batch(capsys):
 
 
 @pytest.mark.slow
-def test_all_scenes_are_measured():
-    costs = effects.measure(batch_size=4, rounds=1, model=vsr.StrainDependent(4))
+def test_scenes_are_measured():
+    named = {one.name: one for one in effects.scenes()}
+    chosen = [named[name] for name in ("+ poses", "+ gravity", "+ spring")]
+    costs = effects.measure(batch_size=4, rounds=1, model=vsr.StrainDependent(4), compared=chosen)
+    assert [cost.name for cost in costs] == ["+ poses", "+ gravity", "+ spring"]
+    operations = [cost.operations or 0 for cost in costs]
+    assert 0 < operations[0] < operations[1] < operations[2]
     assert all(cost.converged == 1 for cost in costs)
-    operations = [cost.operations for cost in costs]
-    assert operations[2] > operations[1]
-    assert operations[9] > operations[2]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "one", [one for one in effects.scenes() if not one.followed], ids=lambda one: one.name
+)
+def test_every_scene_has_a_solution(one):
+    def status(share):
+        inputs = share * jnp.array(one.inputs)
+        return vsr.solve(one.scene, inputs, model=vsr.StrainDependent(4)).status
+
+    found = jax.jit(jax.vmap(status))(jnp.array([0.5, 0.8, 1.2, 1.5]))
+    assert np.all(found == vsr.Status.CONVERGED)
 
 
 @pytest.mark.slow
@@ -140,6 +155,7 @@ def test_the_arm_lies_on_one_pillar_and_not_on_the_other():
         one = named[name]
         inputs = share * np.outer([0.5, 1.0], one.inputs)
         path = jax.jit(lambda u: vsr.follow(one.scene, u, model=vsr.StrainDependent(8)))(inputs)
+        assert np.all(path.status == vsr.Status.CONVERGED)
         contacts = jax.vmap(lambda eq: eq.contacts)(path)
         return np.sum(contacts.force, (1, 2)), np.linalg.norm(np.sum(contacts.friction, (1, 2)))
 

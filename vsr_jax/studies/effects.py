@@ -148,15 +148,17 @@ def measure(
     rounds: int = 5,
     model: StrainDependent | None = None,
     report: Callable[[str], object] = lambda message: None,
+    compared: Sequence[EffectScene] | None = None,
 ) -> list[Cost]:
-    """Costs of all scenes; rounds of timing cover all scenes in turn.
+    """Costs of scenes; rounds of timing cover all scenes in turn.
 
     **Arguments:** `batch_size`: shapes in a batch; `rounds`: number of rounds of timing;
-    `model`: 16 steps by default; `report`: called with a message before each scene is compiled.
+    `model`: 16 steps by default; `report`: called with a message before each scene is compiled;
+    `compared`: `scenes` by default.
     """
     model = StrainDependent(16) if model is None else model
     scale = np.random.default_rng(0).uniform(0.5, 1.5, (batch_size, 1))
-    compared, jobs = scenes(), []
+    compared, jobs = scenes() if compared is None else compared, []
     for one in compared:
         report(f"compiling {one.name}")
         jobs.append(_jobs(one, model, scale))
