@@ -1,14 +1,15 @@
 """Size of the programs of bare and loaded arms, time to trace and to compile them, and time of a
 solve; of two checkouts in one run.
 
-    python benchmarks/bench_compile.py [--against DIR] [--rounds N] [--json FILE]
+    python benchmarks/bench_compile.py [--against DIR] [--scenes NAME ...] [--rounds N]
+        [--json FILE]
 
 Each measurement is made in a process of its own, so that nothing is compiled already. With
 `--against` another checkout of the package is measured in turn with this one, and the last column
 is the ratio of this one to it. "equations" are those of the jaxpr, with the body of a loop counted
 once; they do not depend on the machine. "one" is a solve with its tip, "batch" 512 of them in one
-call, "gradient" the derivative of one by the inputs. "run_ms" is the median of the calls of one
-process.
+call, "gradient" the derivative of one by the inputs, "gradients" 64 of these in one call. "trace_s"
+includes the lowering for XLA; "run_ms" is the median of the calls of one process.
 """
 
 import argparse
@@ -30,7 +31,8 @@ import vsr_jax as vsr
 from vsr_jax.studies import paper
 from vsr_jax.studies.timing import machine, primitives
 
-STEPS, BATCH = 24, 512
+STEPS, BATCH, GRADIENTS = 24, 512, 64
+KINDS = ("one", "batch", "gradient", "gradients")
 HERE = Path(__file__).resolve().parent.parent
 
 
@@ -51,6 +53,10 @@ def scenes() -> dict[str, tuple[vsr.Scene, Any]]:
         for end, angle in angles
     ]
     tip = [vsr.Gravity(), vsr.TipWrench((0.0, 0.0, 0.2))]
+    rubber = vsr.Rod(0.2, vsr.Circular(6e-3), vsr.Material(5e5, poisson=0.4, density=1100.0))
+    rubbing = [
+        vsr.Tendon(vsr.Parallel(y, z), friction=0.1) for y, z in ((4e-3, 0.0), (-2e-3, 4e-3))
+    ]
     return {
         "B1": (paper.scene("B1"), jnp.array([-10.0])),
         "steel rod": (
@@ -58,27 +64,31 @@ def scenes() -> dict[str, tuple[vsr.Scene, Any]]:
             jnp.array([10.0]),
         ),
         "catheter": (vsr.Scene(nitinol, tendons, tip), jnp.arange(8.0)),
+        "friction": (vsr.Scene(rubber, rubbing, vsr.Gravity()), jnp.array([1.0, 2.0])),
     }
 
 
 def program(name: str, kind: str) -> dict[str, float]:
-    """Size and times of one program, "one", "batch" or "gradient"."""
+    """Size and times of one program, of one of the `KINDS`."""
     scene, inputs = scenes()[name]
 
     def tip(inputs: jax.Array) -> jax.Array:
         return vsr.solve(scene, inputs, model=vsr.StrainDependent(STEPS)).tip[1, 3]
 
-    functions: dict[str, Callable] = {"one": tip, "batch": jax.vmap(tip), "gradient": jax.grad(tip)}
+    slope, sizes = jax.grad(tip), {"batch": BATCH, "gradients": GRADIENTS}
+    functions: dict[str, Callable] = dict(
+        zip(KINDS, (tip, jax.vmap(tip), slope, jax.vmap(slope)), strict=True)
+    )
     function = functions[kind]
-    if kind == "batch":
-        inputs = jnp.linspace(0.5, 1.0, BATCH)[:, None] * inputs
+    if kind in sizes:
+        inputs = jnp.linspace(0.5, 1.0, sizes[kind])[:, None] * inputs
     start = time.perf_counter()
     traced = jax.jit(function).trace(inputs)
     lowered, first = traced.lower(), time.perf_counter()
     compiled, second = lowered.compile(), time.perf_counter()
     jax.block_until_ready(compiled(inputs))
     runs = []
-    for _ in range(15 if kind == "batch" else 50):
+    for _ in range(15 if kind in sizes else 50):
         begin = time.perf_counter()
         jax.block_until_ready(compiled(inputs))
         runs.append(time.perf_counter() - begin)
@@ -101,7 +111,7 @@ def measured(checkout: Path, *arguments: str) -> dict[str, float]:
 def compare(options: argparse.Namespace) -> list[dict[str, Any]]:
     """All measurements, in turn between the checkouts."""
     checkouts = {"this": HERE} | ({"other": options.against} if options.against else {})
-    jobs = [(name, kind) for name in scenes() for kind in ("one", "batch", "gradient")]
+    jobs = [(name, kind) for name in options.scenes for kind in KINDS]
     rows = []
     for name, kind in jobs:
         taken: dict[str, list[dict[str, float]]] = {side: [] for side in checkouts}
@@ -127,6 +137,9 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--against", type=Path, metavar="DIR", help="another checkout")
+    parser.add_argument(
+        "--scenes", nargs="+", default=list(scenes()), choices=list(scenes()), help="default: all"
+    )
     parser.add_argument("--rounds", type=int, default=3, help="processes per program (default: 3)")
     parser.add_argument("--json", metavar="FILE", help="save the figures")
     parser.add_argument("--measure", nargs=2, help=argparse.SUPPRESS)
@@ -137,7 +150,13 @@ def main() -> None:
         return
     rows = compare(options)
     if options.json:
-        content = {"machine": machine(), "steps": STEPS, "batch": BATCH, "rows": rows}
+        content = {
+            "machine": machine(),
+            "steps": STEPS,
+            "batch": BATCH,
+            "gradients": GRADIENTS,
+            "rows": rows,
+        }
         Path(options.json).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
