@@ -204,7 +204,6 @@ def tangent_solve(
 
     # all that does not depend on the right side is computed once, before the loop
     _, nearly = jax.linearize(nearly, jax.tree.map(jnp.zeros_like, right))
-    apply, nearly = jax.jit(apply), jax.jit(nearly)  # each traced once for all its uses
 
     def scaled_apply(x: Array) -> Array:
         return to_row * ravel_pytree(apply(unravel_change(to_change * x)))[0]
@@ -214,12 +213,12 @@ def tangent_solve(
         found = followed(nearly(row), row, lambda step: apply(step).coupled, problem)
         return ravel_pytree(found)[0] / to_change
 
-    b, forward = to_row * flat, jax.jit(scaled_nearly)
-    back = jax.jit(jax.linear_transpose(forward, b))
+    b = to_row * flat
+    back = jax.linear_transpose(scaled_nearly, b)
     kept = _KEPT_TOUCHING if problem.softens else _KEPT
 
     def solve(apply: Callable, b: Array) -> Array:
-        return _refined(apply, forward, b, kept)
+        return _refined(apply, scaled_nearly, b, kept)
 
     def transpose_solve(apply: Callable, b: Array) -> Array:
         return _refined(apply, lambda r: back(r)[0], b, kept)
