@@ -103,12 +103,14 @@ def test_command_rejects_an_empty_batch(capsys):
 
 @pytest.mark.slow
 def test_scenes_are_measured():
+    """Of each kind one: strains alone, poses, loads, all effects, and a path of inputs."""
     named = {one.name: one for one in effects.scenes()}
-    chosen = [named[name] for name in ("+ poses", "+ gravity", "+ spring")]
+    names = ["tendons only", "+ poses", "+ gravity", "+ spring", "+ friction of contact"]
+    chosen = [named[name] for name in names]
     costs = effects.measure(batch_size=4, rounds=1, model=vsr.StrainDependent(4), compared=chosen)
-    assert [cost.name for cost in costs] == ["+ poses", "+ gravity", "+ spring"]
+    assert [cost.name for cost in costs] == names
     operations = [cost.operations or 0 for cost in costs]
-    assert 0 < operations[0] < operations[1] < operations[2]
+    assert 0 < operations[1] < operations[2] < operations[3]
     assert all(cost.converged == 1 for cost in costs)
 
 
