@@ -1,8 +1,10 @@
-"""The device that programs are compiled for, and programs that take longer to compile than to
-run."""
+"""The device that programs are compiled for, and programs that take longer to trace and compile
+than to run."""
 
+import gc
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache, wraps
 from typing import Any, TypeVar, cast
 
@@ -19,7 +21,7 @@ F = TypeVar("F", bound=Callable)
 def quick_jit(function: F) -> F:
     """`equinox.filter_jit`, with `quick_compilation` where nothing is traced: JAX takes compiler
     options outside of its transformations only, and batches are traced by `jax.vmap`. `lower` has
-    the options too."""
+    the options too. Nothing looks for garbage meanwhile."""
     plain = eqx.filter_jit(function)
 
     @cache
@@ -28,6 +30,7 @@ def quick_jit(function: F) -> F:
         return eqx.filter_jit(function, **options)
 
     @wraps(function)
+    @garbage_kept()
     def call(*args: Any, **kwargs: Any) -> Any:
         leaves = jax.tree.leaves((args, kwargs))
         if not any(isinstance(leaf, Tracer) for leaf in leaves):
@@ -43,6 +46,19 @@ def quick_jit(function: F) -> F:
 
     call.lower = lower  # pyright: ignore[reportAttributeAccessIssue]
     return cast(F, call)
+
+
+@contextmanager
+def garbage_kept() -> Iterator[None]:
+    """Context in which Python does not look for garbage: a program is traced as some hundred
+    thousand small objects that stay, and looking through them takes a fifth of the time."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 def on_cpu() -> bool:
