@@ -1,6 +1,7 @@
 r"""Solution of the coupled balance (see `arm_balance`): damped Newton steps with a nearly exact
 tangent, and implicit derivatives."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -182,17 +183,26 @@ def _over_nodes(x: Array) -> Array:
     return jnp.sum(once(x, summed=True), axis=(0, 1))
 
 
-def _changes(
-    unknown: ArmUnknown, problem: ArmProblem, free: tuple[int, ...], step: ArmUnknown
-) -> tuple:
-    """Changes of the rows of all couplings by the strain of a step alone."""
+def _linearized(
+    unknown: ArmUnknown, problem: ArmProblem, free: tuple[int, ...]
+) -> tuple[ArmImbalance, Callable[[ArmUnknown], tuple], ArmState]:
+    """The residual, the changes of the rows of all couplings by the strain of a step alone, and the
+    state."""
 
     def rows(xi: Vector) -> tuple:
         at = state_of(xi, unknown.coupled, problem)
-        return imbalance_of(ArmUnknown(xi, unknown.coupled), at, problem, free).coupled
+        imbalance = imbalance_of(ArmUnknown(xi, unknown.coupled), at, problem, free)
+        return imbalance.coupled, (imbalance, at)
 
-    _, changes = jax.jvp(rows, (unknown.xi,), (cast(step.xi, problem.grid.h.dtype),))
-    return jax.tree.map(once, changes)
+    if not problem.follows_rate:
+        _, (imbalance, at) = rows(unknown.xi)
+        return jax.tree.map(once, imbalance), lambda step: (), at
+    _, change, (imbalance, at) = jax.linearize(rows, unknown.xi, has_aux=True)
+
+    def changes(step: ArmUnknown) -> tuple:
+        return jax.tree.map(once, change(cast(step.xi, problem.grid.h.dtype)))
+
+    return jax.tree.map(once, imbalance), changes, at
 
 
 def _solve(
@@ -235,13 +245,12 @@ def _iteration(
 
     def evaluate(unknown: ArmUnknown, damping: Array, share: Array, loose: Array) -> Damped:
         problem = whole.loosened(loose).with_share(share)
-        at = state_of(unknown.xi, unknown.coupled, problem)
-        imbalance = jax.tree.map(once, imbalance_of(unknown, at, problem, free))
+        imbalance, changes, at = _linearized(unknown, problem, free)
         step, definite, doubtful = approximate_solve(unknown, at, imbalance, problem, free, damping)
         slides = problem.dissipates
         if slides is not None:  # no pivot tells then
             definite, doubtful = definite | slides, doubtful & ~slides
-        step = followed(step, imbalance, partial(_changes, unknown, problem, free), problem)
+        step = followed(step, imbalance, changes, problem)
         size = sizes.of_step(step, at)
         # A step that coils the arm may lower the residual without approaching a solution.
         cut = jnp.minimum(1.0, MAX_TURN / jnp.maximum(sizes.turn(step), MAX_TURN))

@@ -16,6 +16,7 @@ derivative of the strain along the arm follows from the balance, $H \xi' = \Lamb
 \partial X + B_\tau \tau'$, without finite differences.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -27,9 +28,10 @@ from ..arm.routing import thread_tangent
 from ..arm.scene import CrossSections, Scene
 from ..numerics import component as c
 from ..numerics.component import Forces, Vector
+from ..numerics.implicit import change_of
 from ..numerics.quadrature import Grid, beyond, interpolation, locate, weighted, within
 from ..numerics.stacked import components
-from .balance import actuation_wrench, completed, free_block, free_components, residual, tangent
+from .balance import completed, free_block, free_components, residual, tangent
 from .coupling import ArmProblem, ArmState, Carried, Coupling, Shares
 from .sizes import node_weight, pull_of, softest
 
@@ -273,24 +275,46 @@ def balanced_strain_rate(
     reaction_rate: Vector | None,
     sections: CrossSections,
     rate: CrossSections,
-    free: tuple,
+    free: tuple[int, ...],
 ) -> Vector:
-    r"""Derivative of the balanced strain along the arm, $\xi' = H^{-1} (\Lambda' - \partial r /
-    \partial X + B_\tau \tau')$, six components; $\xi^{*\prime}$ on rigid pieces.
+    r"""Derivative of the balanced strain along the arm, six components, which keeps the balance,
+
+    $$\frac{d}{dX} r(\xi, \tau, X) = H \xi' - B_\tau \tau' + \partial r / \partial X =
+    \Lambda',$$
+
+    in the free strains; $\xi^{*\prime}$ in the others and on rigid pieces. Its own derivatives
+    follow from this equation too: those through the factors of H would be three times the program.
 
     **Arguments:** `tau_rate`: $\tau'$; `reaction_rate`: $\Lambda'$, None without loads; `rate`: the
     derivative of `sections` along the arm.
     """
 
-    def imbalance(sections: CrossSections) -> Vector:
-        return residual(xi, sections, tau)
+    def imbalance(free_rate: Vector, *given: Any) -> Vector:
+        xi, tau, tau_rate, reaction_rate, sections, rate = given
+        xi_rate = completed(free_rate, sections._replace(rest=rate.rest), free)
+        pair = _alike((xi, sections, tau), (xi_rate, rate, tau_rate))
+        change = jax.jvp(residual, *pair)[1]
+        change = change if reaction_rate is None else c.subtract(change, reaction_rate)
+        return free_components(change, free)
 
-    change = jax.jvp(imbalance, *_alike((sections,), (rate,)))[1]
-    right = c.subtract(actuation_wrench(xi, sections, tau_rate), change)
-    right = right if reaction_rate is None else c.add(right, reaction_rate)
-    factor = c.cholesky(free_block(tangent(xi, sections, tau), free))
-    free_rate = c.cholesky_solve(factor, free_components(right, free))
-    return completed(free_rate, sections._replace(rest=rate.rest), free)
+    def solve(given: tuple, right: Vector) -> Vector:
+        xi, tau, _, _, sections, _ = given
+        factor = c.cholesky(free_block(tangent(xi, sections, tau), free))
+        return c.scale(-1.0, c.cholesky_solve(factor, right))
+
+    @jax.custom_jvp
+    def solved(*given: Any) -> Vector:
+        none = tuple(jnp.zeros_like(x) for x in free_components(given[0], free))
+        return solve(given, imbalance(none, *given))
+
+    @partial(solved.defjvp, symbolic_zeros=True)
+    def _(primals: tuple, tangents: tuple) -> tuple[Vector, Vector]:
+        found = solved(*primals)
+        change = change_of(lambda *given: imbalance(found, *given), primals, tangents)
+        return found, solve(primals, change)
+
+    found = solved(xi, tau, tau_rate, reaction_rate, sections, rate)
+    return completed(found, sections._replace(rest=rate.rest), free)
 
 
 def _alike(values: tuple, rates: tuple) -> tuple[Any, Any]:
