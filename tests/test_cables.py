@@ -123,6 +123,29 @@ def test_a_corner_of_the_path_holds_tension_back():
 
 
 @pytest.mark.slow
+def test_friction_of_an_arm_that_is_twisted_and_cannot_untwist():
+    r"""Its locked strains turn the path too. The angle of the path is that between its chords in
+    space, and the tension at the tip, from the curvature there, is $T_0 e^{-\mu \varphi}$."""
+    d, mu, EI = 0.007, 0.3, 1e6 * np.pi / 4 * 0.01**4
+    rest = (lambda X: 60 * X * (1 + 3 * X), 0.0, 0.0, 1.0, 0.0, 0.0)
+    twisted = vsr.Rod(0.3, vsr.Circular(0.01), ARM.material, rest_strain=rest)
+    tendon = vsr.Tendon(vsr.Parallel(d, 0.0), friction=mu)
+    bending = vsr.Scene(twisted, [tendon], free_strains=("bending_y", "bending_z"))
+    eq = vsr.solve(bending, [2.0], model=vsr.StrainDependent(16), throw=True)
+
+    X = np.linspace(0.0, 0.3, 3001)
+    frames = np.asarray(eq.pose(X))
+    chords = np.diff(frames[:, :3, 3] + d * frames[:, :3, 1], axis=0)
+    sine = np.linalg.norm(np.cross(chords[:-1], chords[1:]), axis=1)
+    rate = np.arctan2(sine, np.sum(chords[:-1] * chords[1:], axis=1)) / X[1]
+    angle = np.sum(rate) * X[1] + (rate[0] + rate[-1]) * X[1] / 2
+
+    kx, _, kz, stretch, _, _ = np.asarray(eq.strain(0.3))
+    along = (stretch - d * kz) / np.hypot(stretch - d * kz, d * kx)
+    np.testing.assert_allclose(EI * kz / (d * along), 2.0 * np.exp(-mu * angle), rtol=1e-6)
+
+
+@pytest.mark.slow
 def test_the_kink_where_another_tendon_ends_is_that_of_finer_steps():
     helices = (
         vsr.Tendon(vsr.Helix(0.007, pitch=0.3), friction=0.3),

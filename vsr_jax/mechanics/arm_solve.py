@@ -80,7 +80,8 @@ def solve_arm(problem: ArmProblem, free: tuple[int, ...], guess: ArmUnknown | No
     def linear_solve(
         x: ArmUnknown, problem: ArmProblem, guess: ArmUnknown | None, right: ArmImbalance
     ) -> ArmUnknown:
-        _, apply, at = jax.linearize(lambda x: with_state(x, problem), x, has_aux=True)
+        prepared = problem.prepared()
+        _, apply, at = jax.linearize(lambda x: with_state(x, prepared), x, has_aux=True)
         return tangent_solve(apply, whole(x, problem), at, problem, right, free)
 
     def at_rest(x: ArmUnknown, problem: ArmProblem, guess: ArmUnknown | None) -> tuple:

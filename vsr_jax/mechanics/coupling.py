@@ -90,6 +90,10 @@ class ArmProblem(NamedTuple):
             couplings=tuple(coupling.relaxed() for coupling in self.couplings),
         )
 
+    def prepared(self) -> "ArmProblem":
+        """The problem for products with one tangent, see `Coupling.prepared`."""
+        return self._replace(couplings=tuple(one.prepared() for one in self.couplings))
+
     def along_sections(self, tau: Forces) -> Forces:
         """Forces at the nodes of the threads that run along the sections, zero for the others."""
         discs = None if self.loads is None else self.loads.discs
@@ -153,6 +157,11 @@ class Coupling(eqx.Module):
     @abstractmethod
     def relaxed(self) -> "Coupling":
         """The coupling with the rest strain as its solution."""
+
+    def prepared(self) -> "Coupling":
+        """The coupling with rows whose derivative takes longer to find, and less to apply many
+        times; the same by default."""
+        return self
 
     @abstractmethod
     def guess(self, forces: Forces, grid: Grid) -> PyTree:

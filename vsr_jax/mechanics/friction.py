@@ -16,19 +16,21 @@ derivative of the strain along the arm follows from the balance, $H \xi' = \Lamb
 \partial X + B_\tau \tau'$, without finite differences.
 """
 
+import dataclasses
 from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array
 
 from ..arm.routing import thread_tangent
 from ..arm.scene import CrossSections, Scene
 from ..numerics import component as c
 from ..numerics.component import Forces, Vector
-from ..numerics.implicit import change_of
+from ..numerics.implicit import at_nodes, change_of
 from ..numerics.quadrature import Grid, beyond, interpolation, locate, weighted, within
 from ..numerics.stacked import components
 from .balance import completed, free_block, free_components, residual, tangent
@@ -54,6 +56,7 @@ class Friction(Coupling):
     - `breaks`: 1 for each step that starts at a breakpoint, where paths may have kinks; None if the
       arm has no breakpoints.
     - `memory`: of each, where the arm follows a path of inputs; None without.
+    - `by_node`: see `prepared`.
     """
 
     follows_rate = True
@@ -62,9 +65,13 @@ class Friction(Coupling):
     sections_rate: CrossSections
     breaks: Array | None
     memory: tuple[Memory, ...] | None = None
+    by_node: bool = eqx.field(static=True, default=False)
 
     def relaxed(self) -> "Friction":
         return self
+
+    def prepared(self) -> "Friction":
+        return dataclasses.replace(self, by_node=True)
 
     def guess(self, forces: Forces, grid: Grid) -> Vector:
         return (jnp.zeros_like(grid.X),) * len(self.places)
@@ -157,16 +164,17 @@ class Friction(Coupling):
     def residual(
         self, x: Vector, at: ArmState, note: None, problem: ArmProblem, free: tuple[int, ...]
     ) -> Vector:
-        xi, sections = at.xi, problem.sections
-        change = None
+        reaction = None
         if at.along is not None:
-            wrench, density = components(at.along.wrench), components(at.along.body_density)
-            change = reaction_rate(xi, wrench, density)
-        tau = tuple(jnp.broadcast_to(force, xi[0].shape) for force in at.tau)
-        xi_rate = balanced_strain_rate(
-            xi, tau, self._slopes(x, at), change, sections, self.sections_rate, free
+            reaction = components(at.along.wrench), components(at.along.body_density)
+        at = at._replace(
+            carried=lax.stop_gradient(at.carried),  # tells only where the cables stick
+            tau=tuple(jnp.broadcast_to(force, at.xi[0].shape) for force in at.tau),
+            loads=None,
+            along=None,
         )
-        return c.subtract(x, self._rates(xi, xi_rate, sections))
+        rows = at_nodes(partial(_rows, free)) if self.by_node else partial(_rows, free)
+        return rows(self, x, at, reaction, problem.sections)
 
     def from_rate(self, xi: Vector, rate: Vector, sections: CrossSections) -> Vector:
         return self._rates(xi, c.add(rate, self.sections_rate.rest), sections)
@@ -198,6 +206,24 @@ class Friction(Coupling):
 
     def radians(self, problem: ArmProblem) -> Vector:
         return (jnp.sqrt(problem.grid.weight * problem.length),) * len(self.places)
+
+
+def _rows(
+    free: tuple[int, ...],
+    friction: Friction,
+    x: Vector,
+    at: ArmState,
+    reaction: tuple[Vector, Vector] | None,
+    sections: CrossSections,
+) -> Vector:
+    """Rows of the friction at the nodes, each from what is given at its node alone; `reaction`: the
+    reaction to the loads and their density."""
+    change = None if reaction is None else reaction_rate(at.xi, *reaction)
+    slopes = friction._slopes(x, at)
+    xi_rate = balanced_strain_rate(
+        at.xi, at.tau, slopes, change, sections, friction.sections_rate, free
+    )
+    return c.subtract(x, friction._rates(at.xi, xi_rate, sections))
 
 
 def friction_of(scene: Scene, grid: Grid) -> Friction | None:

@@ -77,6 +77,13 @@ def change_of(function: Callable, primals: tuple, tangents: tuple) -> Any:
     A scene has dozens of numbers. Usually only a few of them change, and differentiating by the
     others would double the program.
     """
+    return jax.jvp(*_moving(function, primals, tangents))[1]
+
+
+def _moving(
+    function: Callable, primals: tuple, tangents: tuple
+) -> tuple[Callable, tuple[Array, ...], tuple[Array, ...]]:
+    """The function of the primals whose tangent is no symbolic zero, these, and their tangents."""
     leaves, tree = jax.tree.flatten(primals)
     rates = jax.tree.leaves(tangents)
     moving = [i for i, rate in enumerate(rates) if not isinstance(rate, SymbolicZero)]
@@ -87,7 +94,30 @@ def change_of(function: Callable, primals: tuple, tangents: tuple) -> Any:
             *jax.tree.unflatten(tree, [changed.get(i, leaf) for i, leaf in enumerate(leaves)])
         )
 
-    return jax.jvp(moved, tuple(leaves[i] for i in moving), tuple(rates[i] for i in moving))[1]
+    return moved, tuple(leaves[i] for i in moving), tuple(rates[i] for i in moving)
+
+
+def at_nodes(function: Callable) -> Callable:
+    """A function of each node alone, of component arrays to a tuple of them, whose derivative is
+    the product with its Jacobian at each node: a small program, where one tangent system is solved
+    by many products."""
+
+    def rule(primals: tuple, tangents: tuple) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+        moved, values, rates = _moving(function, primals, tangents)
+        shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in jax.tree.leaves(primals)))
+
+        def stacked(parts: tuple[Array, ...]) -> Array:
+            return jnp.stack([jnp.broadcast_to(x, shape) for x in parts])
+
+        found, back = jax.vjp(lambda values: jnp.stack(moved(*values)), stacked(values))
+        unit = jnp.eye(len(found), dtype=found.dtype)
+        unit = unit.reshape(*unit.shape, *(1,) * len(shape)) * jnp.ones_like(found)
+        jacobian = jax.vmap(back)(unit)[0]
+        return tuple(found), tuple(jnp.sum(jacobian * stacked(rates), axis=1))
+
+    found = jax.custom_jvp(function)
+    found.defjvp(rule, symbolic_zeros=True)
+    return found
 
 
 def no_derivative(*values: Array | None) -> tuple[Any, ...]:
