@@ -7,7 +7,7 @@ from typing import Literal
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from ..typing import ArrayLike, Scalar, VectorLike
 from ..validation import choice, concrete, count, instance, numbers
@@ -90,10 +90,6 @@ class Actuator(Part):
     @abstractmethod
     def force(self, value: Scalar) -> Scalar:
         """Signed thread force $\\tau$ [N] for an input."""
-
-    def admits(self, value: Scalar) -> Bool[Array, ""]:
-        """Whether the input is finite and in the actuator's range."""
-        return jnp.isfinite(value) & (value >= self.lowest)
 
     @property
     def breakpoints(self) -> tuple[Scalar, ...]:

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..numerics.component import Forces, Vector, Wrench, add
 from ..numerics.quadrature import piece_edges
+from ..numerics.stacked import stack
 from ..typing import ArrayLike, DTypeLike, Scalar, VectorLike, cast
 from ..validation import concrete, instance, instances, is_traced, numbers, precise
 from .actuator import Actuator
@@ -41,6 +42,19 @@ class CrossSections(NamedTuple):
     def carry(self, forces: Forces) -> Forces:
         """Force of each thread here: equal to that at its start between its ends, else zero."""
         return shared(forces, self.reach)
+
+    def listed(self) -> tuple[Path, Array | None]:
+        """The paths of all threads and their reach, `listed`."""
+        path = Path(*(listed(same) for same in zip(*self.paths, strict=True)))
+        if all(x is None for x in self.reach):
+            return path, None
+        whole = jnp.ones_like(self.paths[0].y)
+        return path, listed(tuple(whole if x is None else x for x in self.reach))
+
+
+def listed(parts: tuple[Array, ...]) -> Array:
+    """What belongs to several threads on a first axis; of one alone, its own."""
+    return parts[0] if len(parts) == 1 else stack(parts)
 
 
 def shared(forces: Forces, shares: tuple[Array | None, ...]) -> Forces:
@@ -211,6 +225,14 @@ class Scene(Part):
         nodes = jax.vmap(at)(X.reshape(-1))
         return jax.tree.map(lambda leaf: leaf.reshape(X.shape), nodes)
 
+    def reach(self, X: Array) -> tuple[Array | None, ...]:
+        """`CrossSections.reach` at abscissas X of any shape."""
+
+        def at(x: Scalar) -> tuple[Array | None, ...]:
+            return tuple(actuator.reach(x) for actuator in self.actuators)
+
+        return jax.tree.map(lambda one: one.reshape(X.shape), jax.vmap(at)(X.reshape(-1)))
+
     def forces(self, inputs: Float[Array, " inputs"]) -> Forces:
         r"""Signed thread forces $\tau$ [N] for the inputs, one scalar per thread."""
         return tuple(
@@ -250,10 +272,8 @@ class Scene(Part):
 
     def admits(self, inputs: Float[Array, " inputs"]) -> Bool[Array, ""]:
         """Whether every input is finite and in its actuator's range."""
-        checks = [
-            actuator.admits(value) for actuator, value in zip(self.actuators, inputs, strict=True)
-        ]
-        return jnp.all(jnp.stack(checks)) if checks else jnp.array(True)
+        lowest = np.array([actuator.lowest for actuator in self.actuators])
+        return jnp.all(jnp.isfinite(inputs) & (inputs >= lowest))
 
     def check_inputs(self, inputs: VectorLike) -> Float[Array, " inputs"]:
         """`inputs` as an array, one number per actuator.

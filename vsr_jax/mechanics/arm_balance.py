@@ -14,7 +14,7 @@ from jaxtyping import Array, PyTree
 from ..arm.scene import Scene, shared
 from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import Grid
-from ..numerics.stacked import components
+from ..numerics.stacked import components, stack
 from .balance import free_components, residual
 from .cable import lengths_of
 from .contact_scales import contacts_of
@@ -53,7 +53,7 @@ class ArmSolution(NamedTuple):
     def shares_at(self, scene: Scene, grid: Grid, X: Array, forces: Forces) -> Shares:
         """Share of each thread's force at abscissas X of any shape; `grid` is that of the nodes,
         `forces` are those at the start."""
-        shares = scene.sections(X).reach
+        shares = scene.reach(X)
         for coupling, x in zip(self.couplings, self.coupled, strict=True):
             shares = coupling.shares_at(x, self.xi, scene, grid, X, forces, shares)
         return shares
@@ -101,10 +101,10 @@ def _carried(
     return carried
 
 
-def carried_forces(unknown: ArmUnknown, problem: ArmProblem) -> Forces:
-    """Force of each thread along the nodes."""
+def carried_from_start(unknown: ArmUnknown, problem: ArmProblem) -> tuple[Forces, Shares]:
+    """Force of each thread at its start, and its share at the nodes."""
     forces = forces_at(problem.couplings, unknown.coupled, problem.forces)
-    return problem.along_sections(shared(forces, _carried(*unknown, problem, forces).shares))
+    return forces, _carried(*unknown, problem, forces).shares
 
 
 def imbalance_of(
@@ -133,8 +133,10 @@ def rounding_of(problem: ArmProblem) -> Array:
 
     straight = tuple(jnp.zeros_like(x) for x in sections.rest[3:])
     total = 1.0 + largest(shape_size((*sections.rest[:3], *straight), length))
-    for place, force in enumerate(problem.forces):
-        total = total + jnp.abs(force) * largest(pull_of(sections, place, length))
+    if problem.forces:
+        pull = pull_of(sections, sections.listed()[0], length)
+        pull = pull.reshape(len(problem.forces), -1, *length.shape)
+        total = total + jnp.sum(jnp.abs(stack(problem.forces)) * jnp.max(pull, axis=1), axis=0)
     if loads is not None:
         densities = (loads.dead_density, loads.follower_density)
         wrenches = [length * density for density in densities if density is not None]

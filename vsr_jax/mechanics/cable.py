@@ -129,9 +129,9 @@ class Lengths(Coupling):
         )
 
     def sizes(self, x: Array, at: ArmState, problem: ArmProblem) -> list[Array]:
-        length = problem.length
+        sections, length = problem.sections, problem.length
         return [
-            tension * pull_of(problem.sections, place, length)
+            tension * pull_of(sections, sections.paths[place], length)
             for place, tension in zip(self.places, x, strict=True)
         ]
 

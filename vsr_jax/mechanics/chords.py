@@ -238,7 +238,7 @@ def pull_of(
     chord = p[:, first + 1] - p[:, first]
     length = jnp.sqrt(dot(chord, chord))
     direction = chord / length
-    since = jnp.moveaxis(weighted(collocation(axis.shape[1]), grid.h * axis, axis=1), 0, 1)
+    since = weighted(collocation(axis.shape[1]), grid.h * axis, axis=1)
     lever = p[:, first][:, :, None, None] - r[:, None, None, :-1] - since[:, None]
     tau = jnp.stack(jnp.broadcast_arrays(*(forces[place] for place in discs.places)))
     return Pull(discs, Chords(lever, direction, length, arms), tau[discs.owner] * direction)

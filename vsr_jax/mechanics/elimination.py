@@ -38,7 +38,7 @@ from ..numerics import component as c, stacked
 from ..numerics.component import Matrix, Tree, Vector
 from ..numerics.once import once
 from ..numerics.quadrature import Grid, collocation, gauss_legendre, remaining, weighted
-from ..numerics.stacked import columns, matmul, matvec, rows, skew, transpose, turned
+from ..numerics.stacked import columns, matmul, matvec, rows, skew, total, transpose, turned
 from .balance import free_block, free_components, spread
 from .elimination_nodes import (
     UNSTABLE_SECTION,
@@ -256,16 +256,6 @@ def _moved(tree: Tree, source: int, destination: int) -> Tree:
     return jax.tree.map(lambda x: jnp.moveaxis(x, source, destination), tree)
 
 
-def _along_step(weights: np.ndarray, values: Array, axis: int) -> Array:
-    """Weighted sums over an axis of nodes, one per row of weights in its place."""
-    return jnp.moveaxis(weighted(weights, values, axis), 0, axis)
-
-
-def _total(values: Array, axis: int) -> Array:
-    """Sum over an axis of nodes."""
-    return weighted(np.ones(values.shape[axis]), values, axis)
-
-
 def _constant(weights: np.ndarray, like: Array) -> Array:
     """Constants in front of the axes of an array."""
     return jnp.asarray(weights, like.dtype).reshape(*weights.shape, *(1,) * like.ndim)
@@ -280,14 +270,14 @@ def _condensed(node: StepNodes, free: tuple[int, ...]) -> tuple[Sections, Conden
     sections, stable = _sections(node, n, free)
     by_end, by_bend = _moments(node, n, sections)
     compliance, negative = _compliance(sections.compliance, by_bend[:3, :, :stages])
-    X = _total(matmul(compliance, by_end[:3, :, None, :stages]), 3)
+    X = total(matmul(compliance, by_end[:3, :, None, :stages]), 3)
     start, turning = by_end[:, :, stages], by_bend[:, :, stages]
-    start = start + _total(matmul(turning, X), 2)
+    start = start + total(matmul(turning, X), 2)
     turn = h * weighted(weights, X, 2) + _constant(np.eye(3, X.shape[1]), h)
-    density = -h * _along_step(rest, matvec(sections.pull, sections.force), 1)
+    density = -h * weighted(rest, matvec(sections.pull, sections.force), 1)
     moment = sections.moment + density[:, :stages]
-    bent = once(_total(matvec(compliance, moment[:, None]), 2))
-    started = _total(matvec(turning, bent), 1)
+    bent = once(total(matvec(compliance, moment[:, None]), 2))
+    started = total(matvec(turning, bent), 1)
     started = jnp.concatenate([rows(started, 0, 3) + density[:, stages], started[3:]])
     before = h * weighted(collocation(stages)[0], rows(node.density, 0, 3), 1)
     step = Condensed(
@@ -347,15 +337,15 @@ def _moments(node: StepNodes, n: Array, sections: Sections) -> tuple[Array, Arra
         if node.slope is not None:
             force = beyond * node.slope[3:][:, :, None]
             change = matmul(by_force[:, :, :, :, None], force[:, :, None, :stages])
-            by_theta = by_theta + _total(change, 3)
+            by_theta = by_theta + total(change, 3)
         none = jnp.zeros_like(same)
         by_theta, by_bend = (
             jnp.concatenate(pair) for pair in ((by_theta, force), (by_bend, jnp.zeros_like(force)))
         )
-        by_end = [jnp.concatenate([same, none]), jnp.concatenate([_total(by_force, 3), same])]
+        by_end = [jnp.concatenate([same, none]), jnp.concatenate([total(by_force, 3), same])]
     by_theta = once(by_theta)
-    by_bend = by_bend + h * _along_step(collocation(stages).T, by_theta, 3)
-    return jnp.concatenate([_total(by_theta, 3), *by_end], axis=1), by_bend
+    by_bend = by_bend + h * weighted(collocation(stages).T, by_theta, 3)
+    return jnp.concatenate([total(by_theta, 3), *by_end], axis=1), by_bend
 
 
 def _compliance(C: Array, by_bend: Array) -> tuple[Array, Array]:
@@ -427,8 +417,8 @@ def _by_start(
     by_end = columns(step.bend, 3, step.bend.shape[1])
     kappa = once(columns(step.bend, 0, 3) + matmul(by_end, joint.wrench[:, :, None]))
     bent = once(step.bent + matvec(by_end, joint.pulled[:, None]))
-    theta = h * _along_step(collocation(stages), kappa, 2) + _constant(np.eye(3), kappa[0, 0])
-    turns = h * _along_step(collocation(stages), bent, 1)
+    theta = h * weighted(collocation(stages), kappa, 2) + _constant(np.eye(3), kappa[0, 0])
+    turns = h * weighted(collocation(stages), bent, 1)
     theta, turns = once(theta), once(turns)
     back, across = transpose(sections.pull), transpose(sections.across)
     upsilon = -matmul(back, theta) - matmul(across, kappa)
@@ -437,8 +427,8 @@ def _by_start(
         push, pushed = joint.wrench[3:, :, None], joint.pulled[3:, None]
         if node.slope is not None:
             by_turn, rest = node.slope[3:], remaining(stages)[:-1]
-            push = push + h * _along_step(rest, matmul(by_turn, theta), 2)
-            pushed = pushed + h * _along_step(rest, matvec(by_turn, turns), 1)
+            push = push + h * weighted(rest, matmul(by_turn, theta), 2)
+            pushed = pushed + h * weighted(rest, matvec(by_turn, turns), 1)
         upsilon = upsilon + matmul(sections.flexibility, push)
         force = force + pushed
     stretched = matvec(sections.flexibility, force) - matvec(back, turns) - matvec(across, bent)

@@ -190,8 +190,8 @@ class Friction(Coupling):
 
     def sizes(self, x: Vector, at: ArmState, problem: ArmProblem) -> list[Array]:
         """By the effect of the rates on the tensions."""
-        length = problem.length
-        pulls = [pull_of(problem.sections, place, length) for place in self.places]
+        sections, length = problem.sections, problem.length
+        pulls = [pull_of(sections, sections.paths[place], length) for place in self.places]
         return [
             length * at.tau[place] * rate * pull
             for place, rate, pull in zip(self.places, x, pulls, strict=True)

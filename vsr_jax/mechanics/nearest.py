@@ -288,7 +288,8 @@ def _polynomial(starts: Array, axis: Array, h: Array) -> Array:
     step."""
     stages = axis.shape[1]
     integrals = interpolation(stages) / np.arange(1, stages + 1)[:, None]
-    return jnp.concatenate([starts[None], h * weighted(integrals, axis, axis=1)])
+    within = jnp.moveaxis(weighted(integrals, axis, axis=1), 1, 0)
+    return jnp.concatenate([starts[None], h * within])
 
 
 def _kinds(obstacles: tuple[Obstacle, ...]) -> tuple[tuple[_Kind, ...], list[int]]:

@@ -31,7 +31,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from ..arm.scene import CrossSections
+from ..arm.scene import CrossSections, listed
 from ..numerics import component as c
 from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import Grid, gauss_legendre
@@ -76,8 +76,9 @@ def step_error(
     total = jnp.sum(lever)
     phase = 2 * jnp.arctan2(jnp.sqrt(second), jnp.sqrt(first)) / (span / 2)
     error = _quadrature(phase, jnp.sqrt(total) * _ratio(first + second, 2 * jnp.sqrt(second)), grid)
-    for wave in _threads(xi, sections, forces, grid):
-        error = jnp.maximum(error, _quadrature(*wave, grid))
+    if forces:
+        waves = _quadrature(*_threads(xi, sections, forces, grid), grid)
+        error = jnp.maximum(error, jnp.max(waves))
     if loaded:
         force = residual(xi, sections, sections.carry(forces))[3:]
         short = grid.h**2 * jnp.sqrt(c.dot(force, force)) > math.pi**2 * _softest(sections)
@@ -91,32 +92,29 @@ def step_error(
 
 def _threads(
     xi: Vector, sections: CrossSections, forces: Forces, grid: Grid
-) -> list[tuple[Scalar, Scalar]]:
+) -> tuple[Array, Array]:
     """For each thread the phase of its wave per step, and the total angle by which it bends and
     shears the arm."""
-    length, waves = jnp.sum(grid.h), []
+
+    def total(x: Array) -> Array:
+        return jnp.sum(x, axis=(-2, -1))
+
+    length, force = jnp.sum(grid.h), listed(forces)
     lever = c.times(sections.flexible, grid.weight * (1 - _TAPER * grid.X / length))
     softest = _softest(sections)
     hardest = jnp.max(
         softest
     )  # the square of a thin arm's stiffness underflows in single precision
-    pushed = sum((jnp.maximum(force, 0.0) for force in forces), jnp.zeros_like(length)) / xi[3]
+    pushed = jnp.sum(jnp.maximum(force, 0.0)) / xi[3]
     shear = jnp.minimum(sections.stiffness[4], sections.stiffness[5])
     shear = jnp.maximum(shear - pushed, _MIN_SHEAR * shear)
-    for path, reach, force in zip(sections.paths, sections.reach, forces, strict=True):
-        square, slope = path.y**2 + path.z**2, path.slope_y**2 + path.slope_z**2
-        inside = c.times(reach, lever)
-        phase = (
-            jnp.sqrt(_ratio(jnp.sum(inside * slope), jnp.sum(inside * square)))
-            * length
-            / grid.h.size
-        )
-        bent = (
-            jnp.sqrt(jnp.sum(lever) * jnp.sum(inside * square / (softest / hardest) ** 2)) / hardest
-        )
-        sheared = jnp.sqrt(jnp.sum(lever) * jnp.sum(inside * slope / shear**2)) / length
-        waves.append((phase, jnp.abs(force) * (bent + sheared)))
-    return waves
+    path, reach = sections.listed()
+    square, slope = path.y**2 + path.z**2, path.slope_y**2 + path.slope_z**2
+    inside = c.times(reach, lever)
+    phase = jnp.sqrt(_ratio(total(inside * slope), total(inside * square)))
+    bent = jnp.sqrt(total(lever) * total(inside * square / (softest / hardest) ** 2)) / hardest
+    sheared = jnp.sqrt(total(lever) * total(inside * slope / shear**2)) / length
+    return phase * length / grid.h.size, jnp.abs(force) * (bent + sheared)
 
 
 def _softest(sections: CrossSections) -> Array:
@@ -147,7 +145,7 @@ def _neighbours(k: Vector) -> tuple[Vector, Vector, Vector, float, float]:
     )
 
 
-def _quadrature(phase: Scalar, bend: Scalar, grid: Grid) -> Scalar:
+def _quadrature(phase: Array, bend: Array, grid: Grid) -> Array:
     """Error of the steps for a wave with `phase` per step that bends the arm by the total angle
     `bend`."""
     stages, steps = grid.X.shape

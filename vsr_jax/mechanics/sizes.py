@@ -4,6 +4,7 @@ shape."""
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ..arm.routing import Path
 from ..arm.scene import CrossSections
 from ..numerics import component as c
 from ..numerics.component import Vector
@@ -27,9 +28,8 @@ def shape_of(wrench: Vector, sections: CrossSections, length: Array) -> Array:
     return c.times(sections.flexible, shape_size(strain, length))
 
 
-def pull_of(sections: CrossSections, place: int, length: Array) -> Array:
+def pull_of(sections: CrossSections, path: Path, length: Array) -> Array:
     """`shape_size` of the strain per unit of a thread's force at rest [1/N]."""
-    path = sections.paths[place]
     wrench = thread_wrench(thread_direction(sections.rest, path)[0], path)
     return shape_of(wrench, sections, length)
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..arm.routing import Path, thread_tangent
-from ..arm.scene import CrossSections, Scene, shared
+from ..arm.scene import CrossSections, Scene, listed, shared
 from ..mechanics.arm_balance import ArmUnknown, problem_of
 from ..mechanics.balance import thread_direction, thread_wrench
 from ..mechanics.coupling import ArmProblem
@@ -85,12 +85,13 @@ class Nodes(NamedTuple):
 
 class Outcome(NamedTuple):
     """Result of a model's solve: its own state (finite even where it failed), the thread forces [N]
-    at their start, a `Status` and the Newton steps."""
+    at their start, a `Status`, the Newton steps, and its nodes, if they are at hand."""
 
     state: Any
     forces: Forces
     status: Array
     steps: Array
+    nodes: Nodes | None = None
 
 
 class Near(NamedTuple):
@@ -215,7 +216,7 @@ class Model(eqx.Module):
             finer.strain(scene, found.forces, found.state, X),
         )
 
-    def step_error(self, scene: Scene, forces: Forces, state: Any) -> Scalar | None:
+    def step_error(self, scene: Scene, outcome: Outcome) -> Scalar | None:
         """Rough estimate of the tip's error by the steps, as a fraction of the arm's length; None
         for adaptive steps."""
         return None
@@ -241,11 +242,12 @@ class SteppedModel(Model):
     def finer(self) -> "SteppedModel":
         return replace(self, steps=2 * self.steps)
 
-    def step_error(self, scene: Scene, forces: Forces, state: Any) -> Scalar:
-        nodes = self.nodes(scene, forces, state)
-        sections = nodes.sections._replace(
-            reach=nodes.shares
-        )  # friction reduces a thread's force, loads do not
+    def step_error(self, scene: Scene, outcome: Outcome) -> Scalar:
+        nodes, forces = outcome.nodes, outcome.forces
+        if nodes is None:
+            nodes = self.nodes(scene, forces, outcome.state)
+        # friction reduces a thread's force, loads do not
+        sections = nodes.sections._replace(reach=nodes.shares)
         return step_error(nodes.xi, sections, forces, nodes.grid, loaded=scene.loaded)
 
     def smooth_strain(
@@ -320,8 +322,8 @@ class SteppedModel(Model):
 
 def resolved(model: Model, scene: Scene, outcome: Outcome) -> Outcome:
     """The outcome, with the status under-resolved where it converged on too few steps for its
-    shape."""
-    error = model.step_error(scene, outcome.forces, outcome.state)
+    shape, and without its nodes."""
+    error, outcome = model.step_error(scene, outcome), outcome._replace(nodes=None)
     if error is None:
         return outcome
     coarse = (outcome.status == Status.CONVERGED) & ~(error <= COARSE)
@@ -348,25 +350,15 @@ def classify(
     length or is reversed. Under loads a node that cannot be balanced is collapsed if one thread
     alone would shorten its path to zero.
     """
-    pulling = jnp.array(False)
-    if tau and loaded:
-        pulling = jnp.any(
-            jnp.stack(
-                [
-                    _exhausted(force, path, sections)
-                    for force, path in zip(tau, sections.paths, strict=True)
-                ]
-            )
-        )
-    elif tau:
-        pulling = jnp.all(jnp.stack([jnp.all(force <= 0) for force in tau]))
-    left = xi[3] / sections.rest[3]
-    for path, reach in zip(sections.paths, sections.reach, strict=True):
+    collapsed = jnp.any(xi[3] <= _NOTHING * sections.rest[3])
+    if sections.paths:
+        path, reach = sections.listed()
         rest = thread_tangent(sections.rest, path)
-        share = dot(thread_tangent(xi, path), rest) / dot(rest, rest)
-        left = jnp.minimum(left, share if reach is None else jnp.where(reach > 0, share, 1.0))
+        left = dot(thread_tangent(xi, path), rest) <= _NOTHING * dot(rest, rest)
+        collapsed = collapsed | jnp.any(left if reach is None else left & (reach > 0))
+        pulling = _exhausted(tau, path, sections) if loaded else jnp.all(listed(tau) <= 0)
+        collapsed = collapsed | jnp.any(~balanced & pulling)
     finite = jnp.all(jnp.isfinite(sum(xi)))
-    collapsed = jnp.any(~balanced & pulling) | jnp.any(left <= _NOTHING)
     status = jnp.where(jnp.all(balanced), Status.CONVERGED, Status.NOT_CONVERGED)
     lost = ~jnp.all(definite)
     status = jnp.where(lost & jnp.all(balanced) if loaded else lost, Status.UNSTABLE, status)
@@ -374,13 +366,14 @@ def classify(
     return jnp.where(finite, status, Status.NOT_FINITE).astype(jnp.int32)
 
 
-def _exhausted(force: Array, path: Path, sections: CrossSections) -> Array:
-    r"""Whether a tendon alone would shorten its path to zero, extrapolated from the rest state: $T
-    w^T \Sigma^{-1} w \ge |t_c|$."""
+def _exhausted(tau: Forces, path: Path, sections: CrossSections) -> Array:
+    r"""Whether one of the threads, listed in `path`, would shorten its path to zero alone,
+    extrapolated from the rest state: $T w^T \Sigma^{-1} w \ge |t_c|$."""
     t, length = thread_direction(sections.rest, path)
     w = thread_wrench(t, path)
-    pull, strain = -force, tuple(x / s for x, s in zip(w, sections.stiffness, strict=True))
-    return jnp.any(pull * times(sections.flexible, dot(w, strain)) >= length)
+    strain = tuple(x / s for x, s in zip(w, sections.stiffness, strict=True))
+    force = listed(tuple(jnp.broadcast_to(force, sections.rest[0].shape) for force in tau))
+    return jnp.any(-force * times(sections.flexible, dot(w, strain)) >= length)
 
 
 def rest_where_failed(status: Array, xi: Vector, sections: CrossSections) -> Vector:

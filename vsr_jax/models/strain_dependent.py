@@ -14,7 +14,13 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..arm.scene import Scene, shared
-from ..mechanics.arm_balance import ArmSolution, ArmUnknown, carried_forces, problem_of, state_of
+from ..mechanics.arm_balance import (
+    ArmSolution,
+    ArmUnknown,
+    carried_from_start,
+    problem_of,
+    state_of,
+)
 from ..mechanics.arm_solve import solve_arm
 from ..mechanics.balance import (
     forces_where,
@@ -26,7 +32,7 @@ from ..mechanics.balance import (
     strain_norm,
     without_force,
 )
-from ..mechanics.coupling import ArmProblem, Coupling, forces_at
+from ..mechanics.coupling import ArmProblem, Coupling
 from ..mechanics.reaction import Loading, react_at
 from ..numerics.component import Forces, Vector
 from ..numerics.magnus import ORDERS
@@ -61,15 +67,17 @@ class StrainDependent(SteppedModel):
     def solve(self, scene: Scene, inputs: Float[Array, " inputs"]) -> Outcome:
         if scene.coupled:
             return self._solve_together(scene, problem_of(scene, inputs, self.grid(scene)))
-        sections, forces = scene.sections(self.grid(scene).X), scene.forces(inputs)
+        grid = self.grid(scene)
+        sections, forces = scene.sections(grid.X), scene.forces(inputs)
         tau = sections.carry(forces)
         solution = solve_balance(sections, tau, None, scene.free)
         status = classify(solution.xi, sections, tau, solution.balanced, solution.definite)
         status = jnp.where(
             status == Status.CONVERGED, _status_of_ends(scene, forces, solution.xi), status
         )
-        state = ArmSolution(rest_where_failed(status, solution.xi, sections), (), ())
-        return Outcome(state, forces, status, solution.steps)
+        xi = rest_where_failed(status, solution.xi, sections)
+        nodes = Nodes(grid, xi, sections, sections.reach)
+        return Outcome(ArmSolution(xi, (), ()), forces, status, solution.steps, nodes)
 
     def solve_from(self, scene: Scene, inputs: Float[Array, " inputs"], near: Near) -> Outcome:
         if not scene.coupled:  # a few steps of each section alone, from anywhere
@@ -118,16 +126,17 @@ class StrainDependent(SteppedModel):
     ) -> Outcome:
         unknown, balanced, definite, steps, loose = solve_arm(problem, scene.free, guess)
         problem = problem.loosened(loose)
-        tau, sections = carried_forces(unknown, problem), problem.sections
+        forces, shares = carried_from_start(unknown, problem)
+        tau, sections = problem.along_sections(shared(forces, shares)), problem.sections
         if problem.loads is not None and problem.loads.discs is not None:
             sections = problem.loads.discs.beside(sections)
         status = classify(unknown.xi, sections, tau, balanced, definite, loaded=scene.reacts)
         sound = status == Status.CONVERGED
-        forces = forces_at(problem.couplings, unknown.coupled, problem.forces)
         xi = rest_where_failed(status, unknown.xi, problem.sections)
         coupled = jax.tree.map(lambda x: jnp.where(sound, x, 0.0), unknown.coupled)
         state = ArmSolution(xi, coupled, problem.couplings)
-        return Outcome(state, forces_where(sound, forces), status, steps)
+        nodes = Nodes(problem.grid, xi, problem.sections, shares)
+        return Outcome(state, forces_where(sound, forces), status, steps, nodes)
 
     def node_strain(self, scene: Scene, state: ArmSolution) -> Vector:
         return state.xi

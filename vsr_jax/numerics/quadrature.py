@@ -132,13 +132,16 @@ def merging(stages: int) -> np.ndarray:
 
 def weighted(weights: np.ndarray, values: Array, axis: int = 0) -> Array:
     """Weighted sums of the values at the nodes of a step, along an axis: one for weights of shape
-    (stages,), or one per row of a matrix of weights, in the first axis."""
-    rows = weights.reshape(-1, weights.shape[-1]).astype(values.dtype)
-    nodes = [lax.index_in_dim(values, i, axis, keepdims=False) for i in range(rows.shape[1])]
-    shape = (-1, *(1,) * nodes[0].ndim)
-    parts = [jnp.multiply(rows[:, i].reshape(shape), node) for i, node in enumerate(nodes)]
-    total = sum(parts[1:], parts[0])
-    return total if weights.ndim > 1 else total[0]
+    (stages,), or one per row of a matrix of weights, in place of the axis."""
+    nodes = [lax.slice_in_dim(values, i, i + 1, axis=axis) for i in range(weights.shape[-1])]
+    if weights.ndim == 1:
+        parts = [float(weight) * node for weight, node in zip(weights, nodes, strict=True)]
+        return lax.squeeze(sum(parts[1:], parts[0]), (axis,))
+    shape = [1] * values.ndim
+    shape[axis] = -1
+    columns = weights.T.astype(values.dtype)
+    parts = [column.reshape(shape) * node for column, node in zip(columns, nodes, strict=True)]
+    return sum(parts[1:], parts[0])
 
 
 def beyond(density: Array, grid: Grid) -> Array:
@@ -148,10 +151,10 @@ def beyond(density: Array, grid: Grid) -> Array:
     **Arguments:** `density`: components $q$ at the nodes, shape (components, stages, steps, *arms).
     """
     sums = weighted(remaining(grid.X.shape[0]), grid.h * density, axis=1)
-    whole = jnp.moveaxis(sums[-1], 1, 0)
+    whole = jnp.moveaxis(sums[:, -1], 1, 0)
     none = jnp.zeros_like(whole[0])
     _, later = lax.scan(lambda total, part: (total + part, total), none, whole, reverse=True)
-    return jnp.moveaxis(sums[:-1], 0, 1) + jnp.moveaxis(later, 0, 1)[:, None]
+    return sums[:, :-1] + jnp.moveaxis(later, 0, 1)[:, None]
 
 
 def sum_along(density: Array, grid: Grid) -> Array:

@@ -61,7 +61,7 @@ class Equilibrium(Solved):
         self, scene: Scene, inputs: Float[Array, " inputs"], model: Model, outcome: Outcome
     ):
         self.scene, self.inputs, self.model = scene, inputs, model
-        self.state, self._forces, self.status, self.steps = outcome
+        self.state, self._forces, self.status, self.steps = outcome[:4]
 
     @property
     def message(self) -> str:

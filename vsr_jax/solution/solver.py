@@ -137,10 +137,11 @@ def checked_outcome(
 ) -> Outcome:
     """Outcome of a solver for admissible inputs, with the status of others and of steps that do not
     resolve the shape."""
-    finite, admitted = jnp.all(jnp.isfinite(inputs)), scene.admits(inputs)
-    values = jnp.where(finite & admitted, inputs, 0.0)
+    given = admitted_status(jnp.asarray(Status.CONVERGED), scene, inputs)
+    values = jnp.where(given == Status.CONVERGED, inputs, 0.0)
     outcome = resolved(model, scene, solver(scene, values))
-    return outcome._replace(status=admitted_status(outcome.status, scene, inputs))
+    status = jnp.where(given == Status.CONVERGED, outcome.status, given)
+    return outcome._replace(status=status.astype(jnp.int32))
 
 
 def admitted_status(
