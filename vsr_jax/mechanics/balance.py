@@ -94,13 +94,13 @@ def actuation_wrench(xi: Vector, sections: CrossSections, tau: Forces) -> Vector
     def more(total: Vector, path: Path, force: Array) -> Vector:
         return add(total, scale(force, thread_wrench(thread_direction(xi, path)[0], path)))
 
-    return _over_threads(more, tuple(jnp.zeros_like(x) for x in xi), sections, tau)
+    return over_threads(more, tuple(jnp.zeros_like(x) for x in xi), sections.paths, tau)
 
 
-def _over_threads(more: Callable, total: Tree, sections: CrossSections, tau: Forces) -> Tree:
+def over_threads(more: Callable, total: Tree, paths: tuple, forces: tuple) -> Tree:
     """A total to which `more` adds the part of each thread, one after another: in a loop of the
     program from `_LOOPED` threads on, where it compiles faster than one copy per thread."""
-    threads = tuple(zip(sections.paths, tau, strict=True))
+    threads = tuple(zip(paths, forces, strict=True))
     if len(threads) < _LOOPED:
         for path, force in threads:
             total = more(total, path, force)
@@ -131,7 +131,7 @@ def tangent(xi: Vector, sections: CrossSections, tau: Forces) -> Matrix:
     def less(lower: Matrix, path: Path, force: Array) -> Matrix:
         return subtract(lower, _thread_stiffness(xi, path, force))
 
-    return _over_threads(less, elastic, sections, tau)
+    return over_threads(less, elastic, sections.paths, tau)
 
 
 def _thread_stiffness(xi: Vector, path: Path, force: Array) -> Matrix:

@@ -26,14 +26,22 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from ..arm.routing import thread_tangent
+from ..arm.routing import Path, thread_tangent
 from ..arm.scene import CrossSections, Scene
 from ..numerics import component as c
 from ..numerics.component import Forces, Vector
 from ..numerics.implicit import at_nodes, change_of
+from ..numerics.once import once
 from ..numerics.quadrature import Grid, beyond, interpolation, locate, weighted, within
 from ..numerics.stacked import components
-from .balance import completed, free_block, free_components, residual, tangent
+from .balance import (
+    completed,
+    free_block,
+    free_components,
+    over_threads,
+    tangent,
+    thread_wrench,
+)
 from .coupling import ArmProblem, ArmState, Carried, Coupling, Shares
 from .sizes import node_weight, pull_of, softest
 
@@ -318,8 +326,7 @@ def balanced_strain_rate(
     def imbalance(free_rate: Vector, *given: Any) -> Vector:
         xi, tau, tau_rate, reaction_rate, sections, rate = given
         xi_rate = completed(free_rate, sections._replace(rest=rate.rest), free)
-        pair = _alike((xi, sections, tau), (xi_rate, rate, tau_rate))
-        change = jax.jvp(residual, *pair)[1]
+        change = residual_rate(xi, xi_rate, tau, tau_rate, sections, rate)
         change = change if reaction_rate is None else c.subtract(change, reaction_rate)
         return free_components(change, free)
 
@@ -343,6 +350,43 @@ def balanced_strain_rate(
     return completed(found, sections._replace(rest=rate.rest), free)
 
 
+def residual_rate(
+    xi: Vector,
+    xi_rate: Vector,
+    tau: Forces,
+    tau_rate: Forces,
+    sections: CrossSections,
+    rate: CrossSections,
+) -> Vector:
+    """Derivative along the arm of the residual without its reaction."""
+    off, off_rate = c.subtract(xi, sections.rest), c.subtract(xi_rate, rate.rest)
+    elastic = c.multiply(sections.stiffness, off_rate)
+    elastic = c.add(elastic, c.multiply(rate.stiffness, off))
+
+    def less(total: Vector, paths: tuple[Path, Path], forces: tuple[Array, Array]) -> Vector:
+        force, force_rate = forces
+        directions = direction_rate(xi, xi_rate, *paths)
+        wrench, wrench_rate = jax.jvp(thread_wrench, *_alike(*zip(directions, paths, strict=True)))
+        total = c.subtract(total, c.scale(force_rate, wrench))
+        return c.subtract(total, c.scale(force, wrench_rate))
+
+    paths = tuple(zip(sections.paths, rate.paths, strict=True))
+    forces = tuple(zip(tau, tau_rate, strict=True))
+    return c.times(sections.flexible, over_threads(less, elastic, paths, forces))
+
+
+def direction_rate(
+    xi: Vector, xi_rate: Vector, path: Path, path_rate: Path
+) -> tuple[Vector, Vector]:
+    r"""Unit tangent t of a thread's path and its derivative $t' = (1 - t t^T) t_c' / |t_c|$ along
+    the arm, in the frame of the section."""
+    t_c, t_c_rate = jax.jvp(thread_tangent, *_alike((xi, path), (xi_rate, path_rate)))
+    length = jnp.sqrt(c.dot(t_c, t_c))
+    t = tuple(once(x / length) for x in t_c)
+    along = c.dot(t, t_c_rate)
+    return t, tuple(once((a - along * b) / length) for a, b in zip(t_c_rate, t, strict=True))
+
+
 def _alike(values: tuple, rates: tuple) -> tuple[Any, Any]:
     """Values and their rates broadcast to one shape: in a batch of arms either may be the same for
     all."""
@@ -357,16 +401,8 @@ def turning_rate(
     xi: Vector, xi_rate: Vector, sections: CrossSections, rate: CrossSections, place: int
 ) -> Array:
     r"""Turning rate of a thread's path, $\varphi' = |t' + k \times t|$ [rad/m]."""
-    t_c, t_c_rate = jax.jvp(
-        thread_tangent, *_alike((xi, sections.paths[place]), (xi_rate, rate.paths[place]))
-    )
-    length = jnp.sqrt(c.dot(t_c, t_c))
-    t = tuple(x / length for x in t_c)
-    along = c.dot(t, t_c_rate)
-    turn = c.add(
-        tuple((a - along * b) / length for a, b in zip(t_c_rate, t, strict=True)),
-        c.cross(xi[:3], t),
-    )
+    t, t_rate = direction_rate(xi, xi_rate, sections.paths[place], rate.paths[place])
+    turn = c.add(t_rate, c.cross(xi[:3], t))
     square = c.dot(turn, turn)
     straight = square <= 0
     return jnp.where(straight, 0.0, jnp.sqrt(jnp.where(straight, 1.0, square)))

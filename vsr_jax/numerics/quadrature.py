@@ -135,13 +135,14 @@ def weighted(weights: np.ndarray, values: Array, axis: int = 0) -> Array:
     (stages,), or one per row of a matrix of weights, in place of the axis."""
     nodes = [lax.slice_in_dim(values, i, i + 1, axis=axis) for i in range(weights.shape[-1])]
     if weights.ndim == 1:
-        parts = [float(weight) * node for weight, node in zip(weights, nodes, strict=True)]
-        return lax.squeeze(sum(parts[1:], parts[0]), (axis,))
-    shape = [1] * values.ndim
-    shape[axis] = -1
-    columns = weights.T.astype(values.dtype)
-    parts = [column.reshape(shape) * node for column, node in zip(columns, nodes, strict=True)]
-    return sum(parts[1:], parts[0])
+        factors = weights.tolist()
+    else:
+        shape = [1] * values.ndim
+        shape[axis] = -1
+        factors = [column.reshape(shape) for column in weights.T.astype(values.dtype)]
+    parts: list[Array] = [factor * node for factor, node in zip(factors, nodes, strict=True)]
+    total = sum(parts[1:], parts[0])
+    return total if weights.ndim > 1 else lax.squeeze(total, (axis,))
 
 
 def beyond(density: Array, grid: Grid) -> Array:
