@@ -1,6 +1,7 @@
 """Compiled programs kept between runs of the command."""
 
 import argparse
+import gc
 import os
 import subprocess
 import sys
@@ -54,6 +55,28 @@ def test_the_folder_is_that_of_the_variable_or_the_users(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "users"))
     monkeypatch.setattr(sys, "platform", "linux")
     assert compiling.cache_folder() == tmp_path / "users" / "vsr_jax"
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_nothing_looks_for_garbage_while_a_program_is_traced(enabled):
+    """Afterwards as before, also where tracing fails."""
+    seen = []
+
+    @quick_jit
+    def traced(x):
+        seen.append(gc.isenabled())
+        return x.reshape(1)
+
+    (gc.enable if enabled else gc.disable)()
+    try:
+        traced(jnp.ones(1))
+        assert gc.isenabled() == enabled
+        with pytest.raises(TypeError):
+            traced(jnp.ones(2))
+        assert gc.isenabled() == enabled
+    finally:
+        gc.enable()
+    assert seen == [False, False]
 
 
 @pytest.mark.parametrize(("most", "left"), [(25, ["b", "c"]), (100, ["a", "b", "c"]), (0, [])])

@@ -1,12 +1,14 @@
 """The implicit derivative of a root: exact in both modes and to second order; a lane without a root
 affects no other."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vsr_jax.numerics.implicit import implicit_root
+from vsr_jax.numerics.implicit import at_nodes, implicit_root
 from vsr_jax.numerics.newton import Root
 
 
@@ -51,3 +53,25 @@ def test_lanes_without_a_root_affect_no_other():
     each = jax.vmap(jax.grad(square_root), in_axes=(0, None))(bad, 1.0)
     np.testing.assert_allclose(each[jnp.array([0, 3])], [0.25, 1 / 6], rtol=1e-15)
     assert np.all(np.isfinite(each))
+
+
+def test_a_function_of_each_node_has_its_own_derivatives():
+    """Against those of the function itself: in both modes, to second order, over a batch, and by an
+    argument that is the same for all nodes."""
+
+    def rows(x, scale):
+        a, b = x
+        return jnp.sin(scale * a) * b, a * b**2
+
+    def total(function, x, scale):
+        return jnp.sum(jnp.stack(function(x, scale)) ** 2)
+
+    x = tuple(jax.random.normal(jax.random.key(0), (2, 5, 3, 4)))  # a batch of 5
+    scale = jnp.array(0.7)
+    for derivative in (jax.jacfwd, jax.jacrev, jax.hessian):
+        found, expected = (
+            jax.vmap(derivative(partial(total, function), argnums=(0, 1)), (0, None))(x, scale)
+            for function in (at_nodes(rows), rows)
+        )
+        for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-13)
