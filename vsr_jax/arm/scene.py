@@ -225,7 +225,7 @@ class Scene(Part):
         nodes = jax.vmap(at)(X.reshape(-1))
         return jax.tree.map(lambda leaf: leaf.reshape(X.shape), nodes)
 
-    def reach(self, X: Array) -> tuple[Array | None, ...]:
+    def thread_reach(self, X: Array) -> tuple[Array | None, ...]:
         """`CrossSections.reach` at abscissas X of any shape."""
 
         def at(x: Scalar) -> tuple[Array | None, ...]:

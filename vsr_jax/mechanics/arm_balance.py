@@ -53,7 +53,7 @@ class ArmSolution(NamedTuple):
     def shares_at(self, scene: Scene, grid: Grid, X: Array, forces: Forces) -> Shares:
         """Share of each thread's force at abscissas X of any shape; `grid` is that of the nodes,
         `forces` are those at the start."""
-        shares = scene.reach(X)
+        shares = scene.thread_reach(X)
         for coupling, x in zip(self.couplings, self.coupled, strict=True):
             shares = coupling.shares_at(x, self.xi, scene, grid, X, forces, shares)
         return shares

@@ -27,7 +27,7 @@ from jaxtyping import Array
 from ..arm.scene import CrossSections, Scene, shared
 from ..mechanics.arm_balance import ArmSolution
 from ..mechanics.balance import solve_balance
-from ..mechanics.friction import balanced_strain_rate, reaction_rate
+from ..mechanics.turning import balanced_strain_rate, reaction_rate
 from ..numerics import component as c
 from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import Grid
