@@ -108,8 +108,8 @@ def measured(checkout: Path, *arguments: str) -> dict[str, float]:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def compare(options: argparse.Namespace) -> list[dict[str, Any]]:
-    """All measurements, in turn between the checkouts."""
+def compare(options: argparse.Namespace) -> None:
+    """All measurements, in turn between the checkouts; saved after each program."""
     checkouts = {"this": HERE} | ({"other": options.against} if options.against else {})
     jobs = [(name, kind) for name in options.scenes for kind in KINDS]
     rows = []
@@ -128,7 +128,15 @@ def compare(options: argparse.Namespace) -> list[dict[str, Any]]:
             ratio = values["this"] / values["other"] if options.against else float("nan")
             texts = [f"{values[s]:12.4g} +-{spread[s] / 2:8.2g}" for s in checkouts]
             print(f"{name:24} {kind:9} {key:10} {'  '.join(texts)}  {ratio:6.2f}", flush=True)
-    return rows
+        if options.json:
+            save(options.json, rows)
+
+
+def save(file: str, rows: list[dict[str, Any]]) -> None:
+    """Writes the figures measured so far."""
+    sizes = {"steps": STEPS, "batch": BATCH, "gradients": GRADIENTS}
+    content = {"machine": machine(), **sizes, "rows": rows}
+    Path(file).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
 def main() -> None:
@@ -148,16 +156,7 @@ def main() -> None:
     if options.measure:
         print(json.dumps(program(*options.measure)))
         return
-    rows = compare(options)
-    if options.json:
-        content = {
-            "machine": machine(),
-            "steps": STEPS,
-            "batch": BATCH,
-            "gradients": GRADIENTS,
-            "rows": rows,
-        }
-        Path(options.json).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    compare(options)
 
 
 if __name__ == "__main__":
