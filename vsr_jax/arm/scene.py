@@ -272,7 +272,7 @@ class Scene(Part):
 
     def admits(self, inputs: Float[Array, " inputs"]) -> Bool[Array, ""]:
         """Whether every input is finite and in its actuator's range."""
-        lowest = np.array([actuator.lowest for actuator in self.actuators])
+        lowest = np.array([actuator.lowest for actuator in self.actuators], inputs.dtype)
         return jnp.all(jnp.isfinite(inputs) & (inputs >= lowest))
 
     def check_inputs(self, inputs: VectorLike) -> Float[Array, " inputs"]:
