@@ -33,7 +33,7 @@ from ..numerics.compiling import quick_jit
 from ..numerics.component import add, multiply, subtract
 from ..numerics.quadrature import Grid
 from ..solution.equilibrium import Equilibrium
-from ..solution.solver import admitted_status, solve
+from ..solution.solver import solve, status_of_inputs
 from ..typing import Scalar, cast
 from ..validation import count, instance, numbers
 
@@ -324,7 +324,7 @@ def _equilibrium(system: _System, u: Array, status: Array, steps: Array) -> Equi
     forces = forces_at(problem.couplings, unknown.coupled, problem.forces)
     state = ArmSolution(*unknown, problem.couplings)
     outcome = resolved(system.model, scene, Outcome(state, forces, status, steps))
-    allowed = admitted_status(outcome.status, scene, inputs)
     found = outcome.status == Status.CONVERGED
-    outcome = outcome._replace(status=jnp.where(found, allowed, outcome.status))
+    status = jnp.where(found, status_of_inputs(scene, inputs), outcome.status)
+    outcome = outcome._replace(status=status)
     return Equilibrium(scene, inputs, system.model, outcome)

@@ -1,7 +1,7 @@
 """A scene: a rod with its actuators and loads, and the quantities that models need at each
 cross-section."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..numerics.component import Forces, Vector, Wrench, add
+from ..numerics.component import Forces, Tree, Vector, Wrench, add
 from ..numerics.quadrature import piece_edges
 from ..numerics.stacked import stack
 from ..typing import ArrayLike, DTypeLike, Scalar, VectorLike, cast
@@ -43,16 +43,21 @@ class CrossSections(NamedTuple):
         """Force of each thread here: equal to that at its start between its ends, else zero."""
         return shared(forces, self.reach)
 
-    def listed(self) -> tuple[Path, Array | None]:
-        """The paths of all threads and their reach, `listed`."""
-        path = Path(*(listed(same) for same in zip(*self.paths, strict=True)))
+    @property
+    def every_path(self) -> Path:
+        """The paths of all threads, `together`."""
+        return Path(*(together(same) for same in zip(*self.paths, strict=True)))
+
+    @property
+    def every_reach(self) -> Array | None:
+        """The reach of all threads, `together`; None if all extend over the whole arm."""
         if all(x is None for x in self.reach):
-            return path, None
+            return None
         whole = jnp.ones_like(self.paths[0].y)
-        return path, listed(tuple(whole if x is None else x for x in self.reach))
+        return together(tuple(whole if x is None else x for x in self.reach))
 
 
-def listed(parts: tuple[Array, ...]) -> Array:
+def together(parts: tuple[Array, ...]) -> Array:
     """What belongs to several threads on a first axis; of one alone, its own."""
     return parts[0] if len(parts) == 1 else stack(parts)
 
@@ -220,10 +225,7 @@ class Scene(Part):
             rod = self.rod
             return CrossSections(rod.stiffness(x), rod.rest(x), paths, reach, rod.flexible(x))
 
-        if X.ndim == 0:
-            return at(X)
-        nodes = jax.vmap(at)(X.reshape(-1))
-        return jax.tree.map(lambda leaf: leaf.reshape(X.shape), nodes)
+        return _at_each(at, X)
 
     def thread_reach(self, X: Array) -> tuple[Array | None, ...]:
         """`CrossSections.reach` at abscissas X of any shape."""
@@ -231,7 +233,7 @@ class Scene(Part):
         def at(x: Scalar) -> tuple[Array | None, ...]:
             return tuple(actuator.reach(x) for actuator in self.actuators)
 
-        return jax.tree.map(lambda one: one.reshape(X.shape), jax.vmap(at)(X.reshape(-1)))
+        return _at_each(at, X)
 
     def forces(self, inputs: Float[Array, " inputs"]) -> Forces:
         r"""Signed thread forces $\tau$ [N] for the inputs, one scalar per thread."""
@@ -361,6 +363,14 @@ class Scene(Part):
             check_numbers(self.rod, self.actuators, self.loads, self.edges)
             check_held(self.rod, self.held)
             check_obstacles(self.rod, self.obstacles, self.edges)
+
+
+def _at_each(function: Callable[[Scalar], Tree], X: Array) -> Tree:
+    """Values of a function of one abscissa at abscissas X, in arrays of their shape."""
+    if X.ndim == 0:
+        return function(X)
+    values = jax.vmap(function)(X.reshape(-1))
+    return jax.tree.map(lambda leaf: leaf.reshape(X.shape), values)
 
 
 def _line(part: Any) -> str:

@@ -134,7 +134,7 @@ def rounding_of(problem: ArmProblem) -> Array:
     straight = tuple(jnp.zeros_like(x) for x in sections.rest[3:])
     total = 1.0 + largest(shape_size((*sections.rest[:3], *straight), length))
     if problem.forces:
-        pull = pull_of(sections, sections.listed()[0], length)
+        pull = pull_of(sections, sections.every_path, length)
         pull = pull.reshape(len(problem.forces), -1, *length.shape)
         total = total + jnp.sum(jnp.abs(stack(problem.forces)) * jnp.max(pull, axis=1), axis=0)
     if loads is not None:

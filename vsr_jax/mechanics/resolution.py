@@ -31,7 +31,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from ..arm.scene import CrossSections, listed
+from ..arm.scene import CrossSections, together
 from ..numerics import component as c
 from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import Grid, gauss_legendre
@@ -99,7 +99,7 @@ def _threads(
     def total(x: Array) -> Array:
         return jnp.sum(x, axis=(-2, -1))
 
-    length, force = jnp.sum(grid.h), listed(forces)
+    length, force = jnp.sum(grid.h), together(forces)
     lever = c.times(sections.flexible, grid.weight * (1 - _TAPER * grid.X / length))
     softest = _softest(sections)
     hardest = jnp.max(
@@ -108,7 +108,7 @@ def _threads(
     pushed = jnp.sum(jnp.maximum(force, 0.0)) / xi[3]
     shear = jnp.minimum(sections.stiffness[4], sections.stiffness[5])
     shear = jnp.maximum(shear - pushed, _MIN_SHEAR * shear)
-    path, reach = sections.listed()
+    path, reach = sections.every_path, sections.every_reach
     square, slope = path.y**2 + path.z**2, path.slope_y**2 + path.slope_z**2
     inside = c.times(reach, lever)
     phase = jnp.sqrt(_ratio(total(inside * slope), total(inside * square)))

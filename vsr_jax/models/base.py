@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..arm.routing import Path, thread_tangent
-from ..arm.scene import CrossSections, Scene, listed, shared
+from ..arm.scene import CrossSections, Scene, shared, together
 from ..mechanics.arm_balance import ArmUnknown, problem_of
 from ..mechanics.balance import thread_direction, thread_wrench
 from ..mechanics.coupling import ArmProblem
@@ -352,11 +352,11 @@ def classify(
     """
     collapsed = jnp.any(xi[3] <= _NOTHING * sections.rest[3])
     if sections.paths:
-        path, reach = sections.listed()
+        path, reach = sections.every_path, sections.every_reach
         rest = thread_tangent(sections.rest, path)
         left = dot(thread_tangent(xi, path), rest) <= _NOTHING * dot(rest, rest)
         collapsed = collapsed | jnp.any(left if reach is None else left & (reach > 0))
-        pulling = _exhausted(tau, path, sections) if loaded else jnp.all(listed(tau) <= 0)
+        pulling = _exhausted(tau, path, sections) if loaded else jnp.all(together(tau) <= 0)
         collapsed = collapsed | jnp.any(~balanced & pulling)
     finite = jnp.all(jnp.isfinite(sum(xi)))
     status = jnp.where(jnp.all(balanced), Status.CONVERGED, Status.NOT_CONVERGED)
@@ -367,12 +367,12 @@ def classify(
 
 
 def _exhausted(tau: Forces, path: Path, sections: CrossSections) -> Array:
-    r"""Whether one of the threads, listed in `path`, would shorten its path to zero alone,
+    r"""Whether one of the threads, all in `path`, would shorten its path to zero alone,
     extrapolated from the rest state: $T w^T \Sigma^{-1} w \ge |t_c|$."""
     t, length = thread_direction(sections.rest, path)
     w = thread_wrench(t, path)
     strain = tuple(x / s for x, s in zip(w, sections.stiffness, strict=True))
-    force = listed(tuple(jnp.broadcast_to(force, sections.rest[0].shape) for force in tau))
+    force = together(tuple(jnp.broadcast_to(force, sections.rest[0].shape) for force in tau))
     return jnp.any(-force * times(sections.flexible, dot(w, strain)) >= length)
 
 

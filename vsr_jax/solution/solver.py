@@ -137,19 +137,15 @@ def checked_outcome(
 ) -> Outcome:
     """Outcome of a solver for admissible inputs, with the status of others and of steps that do not
     resolve the shape."""
-    given = admitted_status(jnp.asarray(Status.CONVERGED), scene, inputs)
-    values = jnp.where(given == Status.CONVERGED, inputs, 0.0)
-    outcome = resolved(model, scene, solver(scene, values))
-    status = jnp.where(given == Status.CONVERGED, outcome.status, given)
-    return outcome._replace(status=status.astype(jnp.int32))
+    given = status_of_inputs(scene, inputs)
+    admitted = given == Status.CONVERGED
+    outcome = resolved(model, scene, solver(scene, jnp.where(admitted, inputs, 0.0)))
+    return outcome._replace(status=jnp.where(admitted, outcome.status, given))
 
 
-def admitted_status(
-    status: Array, scene: Scene, inputs: Float[Array, " inputs"]
-) -> Int[Array, "..."]:
-    """The status, that of the inputs instead where they are NaN or an actuator cannot exert
-    them."""
-    status = jnp.where(scene.admits(inputs), status, Status.INADMISSIBLE)
+def status_of_inputs(scene: Scene, inputs: Float[Array, " inputs"]) -> Int[Array, ""]:
+    """`Status` of inputs that are NaN or that an actuator cannot exert, converged for others."""
+    status = jnp.where(scene.admits(inputs), Status.CONVERGED, Status.INADMISSIBLE)
     finite = jnp.all(jnp.isfinite(inputs))
     return jnp.where(finite, status, Status.NOT_FINITE).astype(jnp.int32)
 
