@@ -2,7 +2,7 @@
 several problems side by side."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -116,125 +116,254 @@ def damped_newton(
     **Returns:** the `Iteration`, whose result is a `Root`: it is converged if the residual is
     rounding or as small as a negligible step.
     """
-    evaluate = jax.jit(evaluate, inline=True)  # traced once for its shapes and in the loop
     twice = increments > 1 or origin is not None
-    origin = start if origin is None else origin
-    levels = increments + stages
-    bound = MAX_STAGED_STEPS if stages else MAX_DAMPED_STEPS
+    first, second = _attempts(floor, increments, stages, twice)
     small = float(jnp.finfo(floor.dtype).eps ** 0.75)
-    accepted = jnp.maximum(_ACCEPTED * floor, small)
+    method = _Method(
+        jax.jit(evaluate, inline=True),  # traced once for its shapes and in the loop
+        measures,
+        start,
+        start if origin is None else origin,
+        first,
+        second,
+        floor,
+        jnp.maximum(_ACCEPTED * floor, small),
+        small,
+        increments,
+        stages,
+        twice,
+    )
+    return Iteration(method.begin, method.advance, method.busy, method.root)
 
-    def going(guard: Guard) -> Array:
-        negligible = (guard.miss < small) | (guard.rises >= _MAX_RISES)
-        done = guard.fresh & (guard.damping == 0) & (guard.merit <= accepted) & negligible
-        stuck = ~guard.definite & (guard.merit < floor)
-        return ~((done | stuck) & (guard.applied == levels)) & (guard.plain < MAX_PLAIN_STEPS)
 
-    def probing(guard: Guard) -> Array:
-        found = ~going(guard) & guard.definite & (guard.merit <= accepted)
+def _attempts(floor: Array, increments: int, stages: int, twice: bool) -> tuple[Guard, Guard]:
+    """State of every problem before its first and before its second attempt."""
+    careful = rules.careful(floor, increments)
+    second = careful._replace(gradual=~careful.gradual)
+    if twice:
+        whole = jnp.full_like(floor, increments + stages)
+        return careful._replace(applied=whole, damping=jnp.zeros_like(floor)), second
+    slow, harder = jnp.full_like(floor, _SLOW_DAMPING), second.applied + _HARDER
+    return careful, second._replace(applied=harder, damping=slow, loose=~second.loose)
+
+
+class _State(NamedTuple):
+    """State of the iteration: the last point, the step to subtract from it, the steps before that
+    one where linear convergence is accelerated, else None, and the rest."""
+
+    x: Any
+    step: Any
+    earlier: Earlier | None
+    guard: Guard
+
+
+class _Trial(NamedTuple):
+    """A point that was evaluated.
+
+    **Fields:** the point; the step to it and the angle by which that turns the arm; whether it is a
+    probe, a plain Newton step, one of a slow second attempt, one without an energy; damping and
+    load increments; what was found; the work of the new residual over the step; whether the step is
+    taken; whether it is to be halved, since something slides, or made shorter, since springs are
+    too steep for it, None where neither can be.
+    """
+
+    point: Any
+    step: Any
+    turn: Array
+    probe: Array
+    plain: Array
+    slow: Array
+    hard: Array
+    damping: Array
+    applied: Array
+    new: Damped
+    left: Array
+    taken: Array
+    slid: Array | None
+    steep: Array | None
+
+    @property
+    def cut(self) -> Array | None:
+        """Whether the step is made shorter; None where none is."""
+        if self.slid is None or self.steep is None:
+            return self.slid if self.steep is None else self.steep
+        return self.slid | self.steep
+
+
+class _Method(NamedTuple):
+    """The method of `damped_newton` with its arguments.
+
+    **Fields:** beside these, the state before the `first` and before the `second` attempt; the
+    largest `accepted` residual and the size of a negligible, `small` step; `twice`: whether the
+    second attempt is the careful one.
+    """
+
+    evaluate: Callable[[Any, Array, Array, Array], Damped]
+    measures: Measures
+    start: Any
+    origin: Any
+    first: Guard
+    second: Guard
+    floor: Array
+    accepted: Array
+    small: float
+    increments: int
+    stages: int
+    twice: bool
+
+    @property
+    def levels(self) -> int:
+        """Load increments and stages."""
+        return self.increments + self.stages
+
+    def begin(self, like: _State | None) -> _State:
+        """The first state; `like`: any other one, None if there is none yet."""
+        if like is None:
+            given = self.start, self.floor, self.floor, self.first.loose
+            step = jax.eval_shape(self.evaluate, *given).step
+        else:
+            step = like.step
+        step = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), step)
+        earlier = None if self.measures.dot is None else Earlier(step, step, step)
+        return _State(self.start, step, earlier, self.first)
+
+    def busy(self, state: _State) -> Array:
+        """Which problems are not done."""
+        return self._going(state.guard) | self._probing(state.guard)
+
+    def root(self, state: _State) -> Root:
+        """The result."""
+        guard = state.guard
+        sound = guard.merit <= self.accepted
+        return Root(state.x, sound, guard.definite, guard.spent, guard.loose)
+
+    def advance(self, state: _State) -> _State:
+        """The state after one evaluation."""
+        trial = self._tried(state)
+        old, hard = state.guard, trial.hard
+        guard, more, last = rules.judged(
+            old,
+            trial.new,
+            trial.left,
+            trial.taken,
+            trial.plain | hard,
+            trial.damping,
+            trial.applied,
+            self.floor,
+            self.accepted,
+            self.small,
+        )
+        shorter = 1.0
+        if trial.cut is not None:
+            less, shorter = rules.shorter(old, trial.steep)
+            guard = select(trial.cut, less, guard._replace(cuts=jnp.zeros_like(old.cuts)))
+        guard = guard._replace(plain=old.plain + trial.plain.astype(jnp.int32))
+        last = once(last)
+        more = once(jnp.where(trial.probe, 1.0, jnp.where(hard, 0.0, more)))
+        step, earlier, guard = self._following(state, trial, guard, more, shorter)
+        work = self.measures.work(trial.new.residual, step)
+        pull = jnp.where(trial.taken, work, guard.pull)
+        go = once(self._going(old))
+        ratio = self.measures.turn(step) / trial.turn
+        guard = select(go, guard._replace(pull=pull), rules.probed(old, trial.probe, ratio))
+        finished = jax.tree.map(
+            lambda a, s: a - jnp.where(last, s, 0.0).astype(a.dtype), trial.point, trial.new.step
+        )
+        x = select(go & trial.taken, finished, state.x)
+        return self._again(_State(x, step, earlier, guard), old, trial, go)
+
+    def _going(self, guard: Guard) -> Array:
+        """Which problems are not solved."""
+        negligible = (guard.miss < self.small) | (guard.rises >= _MAX_RISES)
+        done = guard.fresh & (guard.damping == 0) & (guard.merit <= self.accepted) & negligible
+        stuck = ~guard.definite & (guard.merit < self.floor)
+        ended = (done | stuck) & (guard.applied == self.levels)
+        return ~ended & (guard.plain < MAX_PLAIN_STEPS)
+
+    def _probing(self, guard: Guard) -> Array:
+        """Which solutions are still to be probed."""
+        found = ~self._going(guard) & guard.definite & (guard.merit <= self.accepted)
         decayed = guard.growth < _DECAYED
         return found & guard.doubtful & (guard.probes < rules.PROBES) & ~decayed
 
-    def advance(state: tuple) -> tuple:
-        x, step, earlier, old = state
-        probe = probing(old)
-        step = rules.shrunk(step, probe, measures.turn)
+    def _tried(self, state: _State) -> _Trial:
+        """The next evaluation, and whether its step is taken."""
+        x, step, _, old = state
+        probe = self._probing(old)
+        step = rules.shrunk(step, probe, self.measures.turn)
+        bound = MAX_STAGED_STEPS if self.stages else MAX_DAMPED_STEPS
         plain = (old.spent >= bound) | (old.damping >= _MAX_DAMPING) | (old.plain > 0)
-        trial = jax.tree.map(lambda a, s: jnp.where(old.fresh, a - s.astype(a.dtype), a), x, step)
-        turn = measures.turn(step)
-        slow = old.gradual & (not twice)
-        little = (old.size < _SETTLED) | (~slow & (turn < _SETTLED)) if stages else None
-        damping, applied = rules.attempt(old, little, plain, increments, levels)
-        share = jnp.minimum(applied / increments, 1.0)
-        if stages:
-            share = share + jnp.maximum(applied - increments, 0.0) / stages
-        new = evaluate(trial, jnp.where(probe, _PROBE_DAMPING, damping), share, old.loose)
-        left = measures.work(new.residual, step)
+        point = jax.tree.map(lambda a, s: jnp.where(old.fresh, a - s.astype(a.dtype), a), x, step)
+        turn = self.measures.turn(step)
+        slow = old.gradual & (not self.twice)
+        little = None
+        if self.stages:
+            little = (old.size < _SETTLED) | (~slow & (turn < _SETTLED))
+        damping, applied = rules.attempt(old, little, plain, self.increments, self.levels)
+        share = jnp.minimum(applied / self.increments, 1.0)
+        if self.stages:
+            share = share + jnp.maximum(applied - self.increments, 0.0) / self.stages
+        damped = jnp.where(probe, _PROBE_DAMPING, damping)
+        new = self.evaluate(point, damped, share, old.loose)
+        left = self.measures.work(new.residual, step)
         # the stages that are nearly exact have no energy
-        hard = (old.gradual | (not twice)) & (applied >= increments + SOFT_STAGES)
+        hard = (old.gradual | (not self.twice)) & (applied >= self.increments + SOFT_STAGES)
         if new.slides is not None:
             hard = hard | (new.slides & ~old.gradual)
-        taken = rules.accepted(old, new, left, floor, plain | hard, applied, increments)
-        slid = steep = cut = None
+        taken = rules.accepted(old, new, left, self.floor, plain | hard, applied, self.increments)
+        slid = steep = None
         if new.slides is not None:
-            slid = cut = ~probe & rules.worse(old, new, applied, accepted)
+            slid = once(~probe & rules.worse(old, new, applied, self.accepted))
             taken = taken & ~slid
-        if stages:
-            steep = ~(probe | plain | hard | slow) & rules.steep(old, taken, increments)
-            cut = steep if slid is None else slid | steep
-        taken, cut = once(taken), None if cut is None else once(cut)
-        guard, more, last = rules.judged(
-            old, new, left, taken, plain | hard, damping, applied, floor, accepted, small
-        )
-        shorter = 1.0
-        if cut is not None:
-            less, shorter = rules.shorter(old, steep)
-            guard = select(cut, less, guard._replace(cuts=jnp.zeros_like(old.cuts)))
-        guard = guard._replace(plain=old.plain + plain.astype(jnp.int32))
-        last, more = once(last), once(jnp.where(probe, 1.0, jnp.where(hard, 0.0, more)))
-        new_step = jax.tree.map(lambda s, last: s + more.astype(s.dtype) * last, new.step, step)
-        if stages and measures.dot is not None:
-            back = measures.dot(new_step, step) < -0.5 * measures.dot(step, step)
-            half = jnp.where(hard & ~old.clear & back, 0.5, 1.0)
-            new_step = jax.tree.map(lambda s: half.astype(s.dtype) * s, new_step)
-        if measures.dot is not None:
-            tail = ~probe & (turn < _TAIL) & (new.size > small)
+        if self.stages:
+            steep = once(~(probe | plain | hard | slow) & rules.steep(old, taken, self.increments))
+        taken = once(taken)
+        return _Trial(
+            point, step, turn, probe, plain, slow, hard, damping, applied, new, left, taken,
+            slid, steep,
+        )  # fmt: skip
+
+    def _following(
+        self, state: _State, trial: _Trial, guard: Guard, more: Array, shorter: Array | float
+    ) -> tuple[Any, Earlier | None, Guard]:
+        """The next step, from that found with a part `more` of the last one, or a part `shorter` of
+        the last one again; the steps before it; and the state."""
+        old, new, dot = state.guard, trial.new, self.measures.dot
+        last, earlier = trial.step, state.earlier
+        step = jax.tree.map(lambda s, last: s + more.astype(s.dtype) * last, new.step, last)
+        if dot is not None:
+            if self.stages:
+                back = dot(step, last) < -0.5 * dot(last, last)
+                half = jnp.where(trial.hard & ~old.clear & back, 0.5, 1.0)
+                step = jax.tree.map(lambda s: half.astype(s.dtype) * s, step)
+            assert earlier is not None
+            tail = ~trial.probe & (trial.turn < _TAIL) & (new.size > self.small)
             linear = once(tail & rules.linear(old, guard))
-            near = accelerated(new.step, step, earlier, linear & (old.whole > 0), measures.dot)
-            new_step = select(linear, near, new_step)
+            near = accelerated(new.step, last, earlier, linear & (old.whole > 0), dot)
+            step = select(linear, near, step)
             guard = guard._replace(rate=rules.slowest(old, guard, linear))
-            earlier = select(taken, Earlier(new.step, step, earlier.proposed), earlier)
-        if cut is not None:
-            part = jax.tree.map(lambda s: jnp.asarray(shorter, s.dtype) * s, step)
-            new_step = select(cut, part, new_step)
-        pull = jnp.where(taken, measures.work(new.residual, new_step), guard.pull)
-        go = once(going(old))
-        ratio = measures.turn(new_step) / turn
-        guard = select(go, guard._replace(pull=pull), rules.probed(old, probe, ratio))
-        finished = jax.tree.map(
-            lambda a, s: a - jnp.where(last, s, 0.0).astype(a.dtype), trial, new.step
-        )
-        x = select(go & taken, finished, x)
-        if not (twice or stages):
-            return x, new_step, earlier, guard
-        failed = jnp.where(go, ~(taken & new.definite), old.definite & ~guard.definite)
-        if slid is not None:
+            earlier = select(trial.taken, Earlier(new.step, last, earlier.proposed), earlier)
+        if trial.cut is not None:
+            part = jax.tree.map(lambda s: jnp.asarray(shorter, s.dtype) * s, last)
+            step = select(trial.cut, part, step)
+        return step, earlier, guard
+
+    def _again(self, state: _State, old: Guard, trial: _Trial, go: Array) -> _State:
+        """The state, or that of a second attempt where the first one has failed."""
+        if not (self.twice or self.stages):
+            return state
+        x, step, earlier, guard = state
+        failed = jnp.where(go, ~(trial.taken & trial.new.definite), old.definite & ~guard.definite)
+        if trial.slid is not None:
             most = jnp.where(guard.size < _CLOSE, 2 * _SLIDING, _SLIDING)
-            failed = (failed & ~(go & slid)) | (go & (old.spent >= most))
-        if stages:
-            ended = ~(going(guard) | probing(guard))
-            guard = rules.loosened(guard, hard, ended, levels)
-            if not twice:
-                sound = guard.definite & (guard.merit <= accepted)
+            failed = (failed & ~(go & trial.slid)) | (go & (old.spent >= most))
+        if self.stages:
+            ended = ~self.busy(state)
+            guard = rules.loosened(guard, trial.hard, ended, self.levels)
+            if not self.twice:
+                sound = guard.definite & (guard.merit <= self.accepted)
                 failed = (ended & ~sound) | (guard.spent >= _FIRST_STAGES)
         again = once(~old.gradual & failed)
-        guard = select(again, second._replace(spent=guard.spent), guard)
-        new_step = jax.tree.map(lambda s: jnp.where(again, 0.0, s).astype(s.dtype), new_step)
-        return select(again, origin, x), new_step, earlier, guard
-
-    careful = first = rules.careful(floor, increments)
-    second = careful._replace(gradual=~careful.gradual)
-    if twice:
-        whole = jnp.full_like(floor, levels)
-        first = careful._replace(applied=whole, damping=jnp.zeros_like(floor))
-    else:
-        slow = jnp.full_like(floor, _SLOW_DAMPING)
-        harder = second.applied + _HARDER
-        second = second._replace(applied=harder, damping=slow, loose=~second.loose)
-
-    def begin(like: tuple | None) -> tuple:
-        if like is None:
-            step = jax.eval_shape(evaluate, start, floor, floor, first.loose).step
-        else:
-            step = like[1]
-        step = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), step)
-        return start, step, None if measures.dot is None else Earlier(step, step, step), first
-
-    def busy(state: tuple) -> Array:
-        return going(state[3]) | probing(state[3])
-
-    def root(state: tuple) -> Root:
-        x, _, _, guard = state
-        return Root(x, guard.merit <= accepted, guard.definite, guard.spent, guard.loose)
-
-    return Iteration(begin, advance, busy, root)
+        guard = select(again, self.second._replace(spent=guard.spent), guard)
+        step = jax.tree.map(lambda s: jnp.where(again, 0.0, s).astype(s.dtype), step)
+        return _State(select(again, self.origin, x), step, earlier, guard)
