@@ -12,9 +12,7 @@ from jax import lax
 from jaxtyping import Array
 
 from .once import once
-
-_FEW = 16
-"""Number of terms up to which `total` adds them one by one."""
+from .small_product import product as product, total as total
 
 
 def stack(components: tuple[Array, ...], axis: int = 0) -> Array:
@@ -40,7 +38,12 @@ def blocks(a: Array, b: Array, below: Array, d: Array) -> Array:
 
 def components(x: Array) -> tuple[Array, ...]:
     """The components of the first axis, the inverse of `stack`."""
-    return tuple(lax.index_in_dim(x, i, keepdims=False) for i in range(x.shape[0]))
+    return tuple(lax.squeeze(part, (0,)) for part in _parts(x, 0))
+
+
+def _parts(x: Array, axis: int) -> list[Array]:
+    """The components of an axis, of length one there."""
+    return list(lax.split(x, (1,) * x.shape[axis], axis))
 
 
 def matmul(a: Array, b: Array) -> Array:
@@ -48,22 +51,9 @@ def matmul(a: Array, b: Array) -> Array:
     return once(product(a, b))
 
 
-def product(a: Array, b: Array) -> Array:
-    """As `matmul`, to be part of a sum."""
-    return total(a[:, :, None] * b[None], 1)
-
-
 def matvec(a: Array, v: Array) -> Array:
     """Product of a matrix (n, k, ...) and a vector (k, ...)."""
-    return total(a * v[None], 1)
-
-
-def total(x: Array, axis: int) -> Array:
-    """Sum over an axis; where it is short term by term, since a reduction is slow in a batch."""
-    if x.shape[axis] > _FEW:
-        return jnp.sum(x, axis)
-    parts = [lax.slice_in_dim(x, i, i + 1, axis=axis) for i in range(x.shape[axis])]
-    return lax.squeeze(sum(parts[1:], parts[0]), (axis,))
+    return lax.squeeze(product(a, v[:, None]), (1,))
 
 
 def turned(R: Array, wrench: Array) -> Array:
@@ -79,7 +69,7 @@ def dot(a: Array, b: Array) -> Array:
 
 def cross(a: Array, b: Array) -> Array:
     """Vector product of two vectors."""
-    (x, y, z), (u, v, w) = ([rows(p, i, i + 1) for i in range(3)] for p in (a, b))
+    (x, y, z), (u, v, w) = (_parts(p, 0) for p in (a, b))
     return jnp.concatenate([y * w - z * v, z * u - x * w, x * v - y * u])
 
 
@@ -97,13 +87,9 @@ def transpose(a: Array) -> Array:
 
 def skew(v: Array) -> Array:
     r"""Matrix $\tilde v$ with $\tilde v w = v \times w$."""
-    less = -v
-    x, y, z = (rows(v, i, i + 1) for i in range(3))
+    (x, y, z), (a, b, c) = _parts(v, 0), _parts(-v, 0)
     zero = jnp.zeros_like(x)
-    entries = [
-        zero, rows(less, 2, 3), y, z, zero, rows(less, 0, 1), rows(less, 1, 2), x, zero
-    ]  # fmt: skip
-    return jnp.concatenate(entries).reshape(3, 3, *v.shape[1:])
+    return jnp.concatenate([zero, c, y, z, zero, a, b, x, zero]).reshape(3, 3, *v.shape[1:])
 
 
 def identity(like: Array) -> Array:
@@ -120,8 +106,7 @@ def adjugate(a: Array) -> tuple[Array, Array]:
         return columns(rows(twice, i, i + 3), j, j + 3)
 
     cofactors = once(shifted(1, 1) * shifted(2, 2) - shifted(1, 2) * shifted(2, 1))
-    det = [a[0, j] * cofactors[0, j] for j in range(3)]
-    return transpose(cofactors), det[0] + det[1] + det[2]
+    return transpose(cofactors), dot(a[0], cofactors[0])
 
 
 def trace(a: Array) -> Array:

@@ -1,0 +1,95 @@
+"""Products of small matrices with their components in the first axes, as one operation of a program
+each, as `lax.dot_general` is one: its derivatives in reverse mode are products again, where those
+of multiplications and sums would be three times as many operations, to be traced and compiled.
+
+XLA has no such product: `dot_general` with hundreds of arms or nodes behind the components calls a
+library for each of them.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array
+
+_FEW = 16
+"""Number of terms up to which `total` adds them one by one."""
+
+
+def total(x: Array, axis: int) -> Array:
+    """Sum over an axis; where it is short term by term, since a reduction is slow in a batch."""
+    if not 0 < x.shape[axis] <= _FEW:
+        return jnp.sum(x, axis)
+    parts = lax.split(x, (1,) * x.shape[axis], axis)
+    return lax.squeeze(sum(parts[1:], parts[0]), (axis,))
+
+
+def product(a: Array, b: Array) -> Array:
+    """Product of the matrices (n, k, ...) and (k, m, ...)."""
+    dtype = jnp.promote_types(a.dtype, b.dtype)
+    return _product.bind(a.astype(dtype), b.astype(dtype), lead=0, of=(1, 0))
+
+
+def _contracted(a: Any, b: Any, *, lead: int, of: tuple[int, int]) -> Array:
+    """Sum over the axis `of` each of two matrices behind so many leading axes: (1, 0) is A B, (0,
+    0) is A^T B and (1, 1) is A B^T."""
+    summed, ahead, behind = {(1, 0): (1, 2, 0), (0, 0): (0, 2, 1), (1, 1): (2, 1, 0)}[of]
+    terms = jnp.expand_dims(a, lead + ahead) * jnp.expand_dims(b, lead + behind)
+    return total(terms, lead + summed)
+
+
+def _shape(a: ShapedArray, b: ShapedArray, *, lead: int, of: tuple[int, int]) -> ShapedArray:
+    one, other = a.shape[lead : lead + 2], b.shape[lead : lead + 2]
+    if len(a.shape) != len(b.shape) or one[of[0]] != other[of[1]]:
+        raise TypeError(f"no product of matrices of shapes {a.shape} and {b.shape}")
+    axes = np.broadcast_shapes(
+        a.shape[:lead] + a.shape[lead + 2 :], b.shape[:lead] + b.shape[lead + 2 :]
+    )
+    matrix = one[1 - of[0]], other[1 - of[1]]
+    return ShapedArray((*axes[:lead], *matrix, *axes[lead:]), a.dtype)
+
+
+def _by_first(back: Any, a: Any, b: Any, *, lead: int, of: tuple[int, int]) -> Array:
+    first, second = of
+    if first == 1:
+        found = _product.bind(back, b, lead=lead, of=(1, 1 - second))
+    else:
+        found = _product.bind(b, back, lead=lead, of=(1 - second, 1))
+    return _summed_to(a.aval.shape, found)
+
+
+def _by_second(back: Any, a: Any, b: Any, *, lead: int, of: tuple[int, int]) -> Array:
+    first, second = of
+    if second == 0:
+        found = _product.bind(a, back, lead=lead, of=(1 - first, 0))
+    else:
+        found = _product.bind(back, a, lead=lead, of=(0, 1 - first))
+    return _summed_to(b.aval.shape, found)
+
+
+def _summed_to(shape: tuple[int, ...], x: Array) -> Array:
+    """Sum over the axes along which a factor of a shape was repeated."""
+    axes = tuple(i for i, (one, all) in enumerate(zip(shape, x.shape, strict=True)) if one != all)
+    return jnp.sum(x, axes, keepdims=True) if axes else x
+
+
+def _batched(
+    factors: tuple[Array, Array], axes: tuple, *, lead: int, of: tuple[int, int]
+) -> tuple[Array, int]:
+    a, b = (
+        x[None] if axis is None else jnp.moveaxis(x, axis, 0)
+        for x, axis in zip(factors, axes, strict=True)
+    )
+    return _product.bind(a, b, lead=lead + 1, of=of), 0
+
+
+_product = Primitive("small_product")
+_product.def_impl(_contracted)
+_product.def_abstract_eval(_shape)
+ad.defbilinear(_product, _by_first, _by_second)
+batching.primitive_batchers[_product] = _batched
+mlir.register_lowering(_product, mlir.lower_fun(_contracted, multiple_results=False))
