@@ -3,7 +3,7 @@ converted to arrays, paths; and the change of precision of a tree."""
 
 import os
 from collections.abc import Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -27,7 +27,15 @@ Tree = TypeVar("Tree")
 
 
 def cast(tree: Tree, dtype: DTypeLike) -> Tree:
-    """`tree` with its floating-point arrays in `dtype`."""
-    return jax.tree.map(
-        lambda leaf: leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf, tree
-    )
+    """`tree` with its floating-point arrays in `dtype`, one that stands in several places converted
+    once."""
+    converted: dict[int, Array] = {}
+
+    def once(leaf: Any) -> Any:
+        if not eqx.is_inexact_array(leaf):
+            return leaf
+        if id(leaf) not in converted:
+            converted[id(leaf)] = leaf.astype(dtype)
+        return converted[id(leaf)]
+
+    return jax.tree.map(once, tree)

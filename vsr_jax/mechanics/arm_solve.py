@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from ..numerics import component as c
 from ..numerics.batching import (
@@ -26,6 +26,7 @@ from ..numerics.damped_rules import HARDENING_STAGES, Damped, Measures
 from ..numerics.implicit import implicit_root
 from ..numerics.newton import Root
 from ..numerics.once import once
+from ..numerics.stacked import components, stack, total
 from ..typing import cast
 from .arm_balance import ArmImbalance, ArmUnknown, imbalance_of, rounding_of, state_of
 from .arm_tangent import approximate_solve, followed, tangent_solve
@@ -126,6 +127,22 @@ def _start(problem: ArmProblem, free: tuple[int, ...]) -> ArmUnknown:
     return ArmUnknown(with_locked(xi, problem.sections, free), coupled)
 
 
+class _Point(NamedTuple):
+    """Unknowns or a step in the iteration: the free strains as one array (free, stages, steps,
+    *arms), a program smaller by their number, and the unknowns of each coupling."""
+
+    xi: Array
+    coupled: tuple[PyTree, ...]
+
+
+def _point(unknown: ArmUnknown, free: tuple[int, ...]) -> _Point:
+    return _Point(stack(free_components(unknown.xi, free)), unknown.coupled)
+
+
+def _unknown(point: _Point, problem: ArmProblem, free: tuple[int, ...]) -> ArmUnknown:
+    return ArmUnknown(completed(components(point.xi), problem.sections, free), point.coupled)
+
+
 class _Sizes(NamedTuple):
     """Dimensionless sizes of steps and residuals, one entry per arm of a batch (see
     `shape_size`)."""
@@ -153,23 +170,25 @@ class _Sizes(NamedTuple):
                 square = square + jnp.mean(once(size**2, summed=True), axis=self._inner(size))
         return jnp.sqrt(square)
 
-    def turn(self, step: ArmUnknown) -> Array:
+    def turn(self, step: _Point) -> Array:
         """Total angle by which the step bends and twists the arm [rad]."""
-        x, y, z = (jnp.abs(k) for k in cast(step.xi[:3], self.problem.grid.h.dtype))
-        return _over_nodes(self.problem.grid.weight * (x + y + z))
+        bending = step.xi[: sum(i < 3 for i in self.free)]
+        angle = total(jnp.abs(cast(bending, self.problem.grid.h.dtype)), 0)
+        return _over_nodes(self.problem.grid.weight * angle)
 
-    def work(self, wrench: Vector, step: ArmUnknown) -> Array:
+    def work(self, wrench: Vector, step: _Point) -> Array:
         """Work of the residual over a step, in single precision: only its sign and rough size
         matter."""
-        per_length = c.dot(wrench, free_components(step.xi, self.free))
+        per_length = c.dot(wrench, components(step.xi))
         work = _over_nodes(c.single(self.problem.grid.weight) * per_length)
         return work.astype(self.problem.grid.h.dtype)
 
-    def dot(self, one: ArmUnknown, other: ArmUnknown) -> Array:
+    def dot(self, one: _Point, other: _Point) -> Array:
         """Scalar product of two steps by their elastic energy, in single precision."""
         stiffness, weight = c.single((self.problem.sections.stiffness, self.problem.grid.weight))
-        terms = (s * x * y for s, x, y in zip(stiffness, one.xi, other.xi, strict=True))
-        return _over_nodes(weight * sum(terms)).astype(self.problem.grid.h.dtype)
+        elastic = weight * stack(free_components(stiffness, self.free))
+        work = _over_nodes(elastic * one.xi * other.xi, 3)
+        return work.astype(self.problem.grid.h.dtype)
 
     def _inner(self, x: Array) -> tuple[int, ...]:
         return tuple(range(x.ndim - len(self.arms)))
@@ -178,10 +197,10 @@ class _Sizes(NamedTuple):
         return jnp.max(once(jnp.abs(x)), axis=self._inner(x))
 
 
-def _over_nodes(x: Array) -> Array:
-    """Sum over all nodes. The terms are an array of their own: in the loop of a sum XLA computes
-    them one by one, with all that leads to them."""
-    return jnp.sum(once(x, summed=True), axis=(0, 1))
+def _over_nodes(x: Array, axes: int = 2) -> Array:
+    """Sum over all nodes, in the first axes. The terms are an array of their own: in the loop of a
+    sum XLA computes them one by one, with all that leads to them."""
+    return jnp.sum(once(x, summed=True), axis=tuple(range(axes)))
 
 
 def _linearized(
@@ -216,6 +235,7 @@ def _solve(
         root = queued(partial(_iteration, free, (lanes,)), given, arms[0], lanes)
     else:
         root = iterated(_iteration(free, arms, given))
+    root = root._replace(x=_unknown(root.x, whole, free))
     if whole.dissipates is None:
         return root
     whole = whole.loosened(root.loose)
@@ -240,26 +260,27 @@ def _iteration(
     whole, origin, guess, floor = given
     start, origin = jax.tree.map(
         lambda x: jnp.broadcast_to(x, (*x.shape[: x.ndim - len(arms)], *arms)),
-        (origin if guess is None else guess, origin),
+        (_point(origin if guess is None else guess, free), _point(origin, free)),
     )
     sizes = _Sizes(whole, free, arms)
 
-    def evaluate(unknown: ArmUnknown, damping: Array, share: Array, loose: Array) -> Damped:
+    def evaluate(point: _Point, damping: Array, share: Array, loose: Array) -> Damped:
         problem = whole.loosened(loose).with_share(share)
+        unknown = _unknown(point, whole, free)
         imbalance, changes, at = _linearized(unknown, problem, free)
         step, definite, doubtful = approximate_solve(unknown, at, imbalance, problem, free, damping)
         slides = problem.dissipates
         if slides is not None:  # no pivot tells then
             definite, doubtful = definite | slides, doubtful & ~slides
         step = followed(step, imbalance, changes, problem)
-        size = sizes.of_step(step, at)
+        size, point = sizes.of_step(step, at), jax.tree.map(once, _point(step, free))
         # A step that coils the arm may lower the residual without approaching a solution.
-        cut = jnp.minimum(1.0, MAX_TURN / jnp.maximum(sizes.turn(step), MAX_TURN))
-        step = jax.tree.map(lambda x: cut.astype(x.dtype) * x, step)
+        cut = jnp.minimum(1.0, MAX_TURN / jnp.maximum(sizes.turn(point), MAX_TURN))
+        point = jax.tree.map(lambda x: cut.astype(x.dtype) * x, point)
         merit = sizes.of_imbalance(imbalance, at)
         clear = clear_of(at, problem)
         wrench = c.single(imbalance.wrench)
-        return Damped(step, size, wrench, merit, definite, doubtful, clear, slides)
+        return Damped(point, size, wrench, merit, definite, doubtful, clear, slides)
 
     return damped_newton(
         evaluate,

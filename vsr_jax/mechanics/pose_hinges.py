@@ -277,7 +277,8 @@ def _carried(beyond: Array, link: Array) -> Array:
 
 def halves(x: Array) -> tuple[Array, Array]:
     """The rows of moments and those of forces."""
-    return rows(x, 0, 3), rows(x, 3, 6)
+    first, second = lax.split(x, (3, 3))
+    return first, second
 
 
 def _wider(matrix: Array, more: int) -> Array:

@@ -35,6 +35,7 @@ from ..arm.scene import CrossSections, together
 from ..numerics import component as c
 from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import Grid, gauss_legendre
+from ..numerics.stacked import stack
 from ..typing import Scalar
 from .balance import residual
 
@@ -63,16 +64,17 @@ def step_error(
         order = jnp.argsort(sections.flexible[0] == 0)
         xi, sections, grid = jax.tree.map(lambda x: x[..., order], (xi, sections, grid))
     stages, length = grid.X.shape[0], jnp.sum(grid.h)
-    before, here, after, gap, span = _neighbours(xi[:3])
-    h = grid.h[: here[0].size]
+    before, here, after, gap, span = _neighbours(stack(xi[:3]))
+    h = grid.h[: here.shape[1]]
     lever = h * (1 - _TAPER * jnp.mean(grid.X, axis=0) / length)[: h.size]
-    change = tuple((b - a) / span for a, b in zip(before, after, strict=True))
+    change = (after - before) / span
     if sections.flexible is not None:
-        bends = jnp.prod(jnp.stack([x for (x,) in _neighbours((sections.flexible,))[:3]]), axis=0)
-        lever, change = bends * lever, c.scale(bends, change)
-    first = (span / 2) ** 2 * jnp.sum(lever * c.dot(change, change))
-    bent = tuple(x - a - gap * d for x, a, d in zip(here, before, change, strict=True))
-    second = jnp.sum(lever * c.dot(bent, bent))
+        first, second, third, *_ = _neighbours(sections.flexible[None])
+        bends = (first * second * third)[0]
+        lever, change = bends * lever, bends * change
+    turned = _square(change)
+    first = (span / 2) ** 2 * jnp.sum(lever * turned)
+    second = jnp.sum(lever * _square(here - before - gap * change))
     total = jnp.sum(lever)
     phase = 2 * jnp.arctan2(jnp.sqrt(second), jnp.sqrt(first)) / (span / 2)
     error = _quadrature(phase, jnp.sqrt(total) * _ratio(first + second, 2 * jnp.sqrt(second)), grid)
@@ -82,11 +84,9 @@ def step_error(
     if loaded:
         force = residual(xi, sections, sections.carry(forces))[3:]
         short = grid.h**2 * jnp.sqrt(c.dot(force, force)) > math.pi**2 * _softest(sections)
-        angle = jnp.where(
-            jnp.any(short, axis=0)[: h.size], span * h * jnp.sqrt(c.dot(change, change)), 0.0
-        )
+        angle = jnp.where(jnp.any(short, axis=0)[: h.size], span * h * jnp.sqrt(turned), 0.0)
         error = jnp.maximum(error, jnp.max(angle, initial=0.0))
-    series = jnp.sum(lever * (h**2 * c.dot(here, here)) ** (2 * stages - 1) * c.dot(change, change))
+    series = jnp.sum(lever * (h**2 * _square(here)) ** (2 * stages - 1) * turned)
     return error + _NEGLECTED[stages] * jnp.sqrt(total * series)
 
 
@@ -121,28 +121,21 @@ def _softest(sections: CrossSections) -> Array:
     return jnp.minimum(sections.stiffness[1], sections.stiffness[2])
 
 
-def _neighbours(k: Vector) -> tuple[Vector, Vector, Vector, float, float]:
-    """Values at three successive nodes for each step, as far as available, and the distances of the
-    second and third from the first, in steps."""
-    stages, nodes = k[0].shape[0], gauss_legendre(k[0].shape[0])[0]
+def _neighbours(x: Array) -> tuple[Array, Array, Array, float, float]:
+    """Values (n, steps) at three successive nodes for each step, as far as available, of values (n,
+    stages, steps), and the distances of the second and third from the first, in steps."""
+    stages, nodes = x.shape[1], gauss_legendre(x.shape[1])[0]
     if stages == 1:
-        return (
-            tuple(x[0, :-2] for x in k),
-            tuple(x[0, 1:-1] for x in k),
-            tuple(x[0, 2:] for x in k),
-            1.0,
-            2.0,
-        )
-    size = k[0].shape[1] - (stages == 2)
-    last = tuple(x[0, 1:] if stages == 2 else x[2] for x in k)
-    span = 1.0 if stages == 2 else float(nodes[2] - nodes[0])
-    return (
-        tuple(x[0, :size] for x in k),
-        tuple(x[1, :size] for x in k),
-        last,
-        float(nodes[1] - nodes[0]),
-        span,
-    )
+        return x[:, 0, :-2], x[:, 0, 1:-1], x[:, 0, 2:], 1.0, 2.0
+    gap = float(nodes[1] - nodes[0])
+    if stages == 2:
+        return x[:, 0, :-1], x[:, 1, :-1], x[:, 0, 1:], gap, 1.0
+    return x[:, 0], x[:, 1], x[:, 2], gap, float(nodes[2] - nodes[0])
+
+
+def _square(x: Array) -> Array:
+    """Squared norm of vectors (3, ...)."""
+    return jnp.sum(x**2, axis=0)
 
 
 def _quadrature(phase: Array, bend: Array, grid: Grid) -> Array:

@@ -32,7 +32,8 @@ def single(tree: Tree) -> Tree:
 
 def split(array: Array) -> Vector:
     """Components of the last axis of `array`."""
-    return tuple(array[..., i] for i in range(array.shape[-1]))
+    axis = array.ndim - 1
+    return tuple(lax.squeeze(x, (axis,)) for x in lax.split(array, (1,) * array.shape[-1], axis))
 
 
 def join(components: Vector) -> Array:
@@ -76,7 +77,12 @@ def _product(a: Array | float, b: Array) -> Array:
 
 def select(condition: Array, a: Tree, b: Tree) -> Tree:
     """`a` where the condition holds and `b` elsewhere, component by component."""
-    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), a, b)
+
+    def chosen(x: Array, y: Array) -> Array:
+        alike = _alike(x, y) and condition.shape == x.shape
+        return lax.select(condition, x, y) if alike else jnp.where(condition, x, y)
+
+    return jax.tree.map(chosen, a, b)
 
 
 def add(a: Tree, b: Tree) -> Tree:

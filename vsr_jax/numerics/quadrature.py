@@ -133,7 +133,7 @@ def merging(stages: int) -> np.ndarray:
 def weighted(weights: np.ndarray, values: Array, axis: int = 0) -> Array:
     """Weighted sums of the values at the nodes of a step, along an axis: one for weights of shape
     (stages,), or one per row of a matrix of weights, in place of the axis."""
-    nodes = [lax.slice_in_dim(values, i, i + 1, axis=axis) for i in range(weights.shape[-1])]
+    nodes = lax.split(values, (1,) * weights.shape[-1], axis)
     if weights.ndim == 1:
         factors = weights.tolist()
     else:
