@@ -42,8 +42,8 @@ def test_follower_loads_alone_carry_the_change_of_the_force():
     follower = operations(
         vsr.Scene(ARM, [vsr.Tendon(PATH)], [vsr.TipWrench((0.0, 0.0, 0.1), frame="body")])
     )
-    # a product of matrices counts once, also with six rows in place of three: those of the change of
-    # the force, of its moment, and of the strain that it causes come to what dead loads have
+    # a product of matrices counts once, also with six rows in place of three: those of the change
+    # of the force, of its moment, and of the strain that it causes come to what dead loads have
     assert follower["small_product"] == dead["small_product"] + 3
     assert follower.total() > dead.total() + 75
 
