@@ -227,7 +227,7 @@ def partial_rotation(k: Array, h: Array, sigma: Array | float) -> Array:
     stages = k.shape[1]
     near = k[:, stages // 2]  # differences from it are exact, or nearly
     b = once(weighted(interpolation(stages, 0.5), k - near[:, None], axis=1))
-    b = [lax.squeeze(x, (1,)) for x in lax.split(b, (1,) * stages, 1)]
+    b = components(b, axis=1)
     h, middle = h * sigma, 0.5 * (sigma - 1.0)
     first = near + b[0]
     if stages == 1:

@@ -69,8 +69,8 @@ def step_error(
     lever = h * (1 - _TAPER * jnp.mean(grid.X, axis=0) / length)[: h.size]
     change = (after - before) / span
     if sections.flexible is not None:
-        first, second, third, *_ = _neighbours(sections.flexible[None])
-        bends = (first * second * third)[0]
+        near, middle, far, *_ = _neighbours(sections.flexible[None])
+        bends = (near * middle * far)[0]
         lever, change = bends * lever, bends * change
     turned = _square(change)
     first = (span / 2) ** 2 * jnp.sum(lever * turned)

@@ -16,6 +16,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ..typing import cast
+from . import stacked
 
 Vector = tuple[Array, ...]
 Vector3 = tuple[Array, Array, Array]
@@ -32,8 +33,7 @@ def single(tree: Tree) -> Tree:
 
 def split(array: Array) -> Vector:
     """Components of the last axis of `array`."""
-    axis = array.ndim - 1
-    return tuple(lax.squeeze(x, (axis,)) for x in lax.split(array, (1,) * array.shape[-1], axis))
+    return stacked.components(array, array.ndim - 1)
 
 
 def join(components: Vector) -> Array:

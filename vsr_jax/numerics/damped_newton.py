@@ -163,8 +163,8 @@ class _Trial(NamedTuple):
     **Fields:** the point; the step to it and the angle by which that turns the arm; whether it is a
     probe, a plain Newton step, one of a slow second attempt, one without an energy; damping and
     load increments; what was found; the work of the new residual over the step; whether the step is
-    taken; whether it is to be halved, since something slides, or made shorter, since springs are
-    too steep for it, None where neither can be.
+    taken; whether it is to be halved, since something slides, whether made shorter, since springs
+    are too steep for it, and whether one of both, None where that cannot be.
     """
 
     point: Any
@@ -181,13 +181,7 @@ class _Trial(NamedTuple):
     taken: Array
     slid: Array | None
     steep: Array | None
-
-    @property
-    def cut(self) -> Array | None:
-        """Whether the step is made shorter; None where none is."""
-        if self.slid is None or self.steep is None:
-            return self.slid if self.steep is None else self.steep
-        return self.slid | self.steep
+    cut: Array | None
 
 
 class _Method(NamedTuple):
@@ -311,16 +305,17 @@ class _Method(NamedTuple):
         if new.slides is not None:
             hard = hard | (new.slides & ~old.gradual)
         taken = rules.accepted(old, new, left, self.floor, plain | hard, applied, self.increments)
-        slid = steep = None
+        slid = steep = cut = None
         if new.slides is not None:
-            slid = once(~probe & rules.worse(old, new, applied, self.accepted))
+            slid = cut = ~probe & rules.worse(old, new, applied, self.accepted)
             taken = taken & ~slid
         if self.stages:
-            steep = once(~(probe | plain | hard | slow) & rules.steep(old, taken, self.increments))
-        taken = once(taken)
+            steep = ~(probe | plain | hard | slow) & rules.steep(old, taken, self.increments)
+            cut = steep if slid is None else slid | steep
+        taken, cut = once(taken), None if cut is None else once(cut)
         return _Trial(
             point, step, turn, probe, plain, slow, hard, damping, applied, new, left, taken,
-            slid, steep,
+            slid, steep, cut,
         )  # fmt: skip
 
     def _following(

@@ -13,6 +13,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..typing import Scalar
+from .small_product import parts
 
 
 class Grid(NamedTuple):
@@ -133,15 +134,15 @@ def merging(stages: int) -> np.ndarray:
 def weighted(weights: np.ndarray, values: Array, axis: int = 0) -> Array:
     """Weighted sums of the values at the nodes of a step, along an axis: one for weights of shape
     (stages,), or one per row of a matrix of weights, in place of the axis."""
-    nodes = lax.split(values, (1,) * weights.shape[-1], axis)
+    nodes = parts(values, axis)
     if weights.ndim == 1:
         factors = weights.tolist()
     else:
         shape = [1] * values.ndim
         shape[axis] = -1
         factors = [column.reshape(shape) for column in weights.T.astype(values.dtype)]
-    parts: list[Array] = [factor * node for factor, node in zip(factors, nodes, strict=True)]
-    total = sum(parts[1:], parts[0])
+    terms: list[Array] = [factor * node for factor, node in zip(factors, nodes, strict=True)]
+    total = sum(terms[1:], terms[0])
     return total if weights.ndim > 1 else lax.squeeze(total, (axis,))
 
 
@@ -196,8 +197,8 @@ def within(density: Array, grid: Grid, step: Array, sigma: Array | float) -> Arr
     r"""Integral from the start of a step to the fraction $\sigma$ of it of the polynomial through
     the values at its nodes, shape (components, stages, steps)."""
     weights = integral_weights(jnp.asarray(sigma, density.dtype), grid.X.shape[0])
-    parts = [weight * density[:, i, step] for i, weight in enumerate(weights)]
-    return grid.h[step] * sum(parts[1:], parts[0])
+    terms = [weight * density[:, i, step] for i, weight in enumerate(weights)]
+    return grid.h[step] * sum(terms[1:], terms[0])
 
 
 def value_weights(sigma: Array, stages: int) -> Array:

@@ -20,12 +20,18 @@ _FEW = 16
 """Number of terms up to which `total` adds them one by one."""
 
 
+def parts(x: Array, axis: int) -> list[Array]:
+    """The components of an axis, of length one there. Their transpose joins them, where that of
+    slices would pad and add each."""
+    return list(lax.split(x, (1,) * x.shape[axis], axis))
+
+
 def total(x: Array, axis: int) -> Array:
     """Sum over an axis; where it is short term by term, since a reduction is slow in a batch."""
     if not 0 < x.shape[axis] <= _FEW:
         return jnp.sum(x, axis)
-    parts = lax.split(x, (1,) * x.shape[axis], axis)
-    return lax.squeeze(sum(parts[1:], parts[0]), (axis,))
+    first, *others = parts(x, axis)
+    return lax.squeeze(sum(others, first), (axis,))
 
 
 def product(a: Array, b: Array) -> Array:

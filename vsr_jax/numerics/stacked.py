@@ -12,7 +12,7 @@ from jax import lax
 from jaxtyping import Array
 
 from .once import once
-from .small_product import product as product, total as total
+from .small_product import parts, product as product, total as total
 
 
 def stack(components: tuple[Array, ...], axis: int = 0) -> Array:
@@ -36,14 +36,9 @@ def blocks(a: Array, b: Array, below: Array, d: Array) -> Array:
     return jnp.concatenate([top, bottom])
 
 
-def components(x: Array) -> tuple[Array, ...]:
-    """The components of the first axis, the inverse of `stack`."""
-    return tuple(lax.squeeze(part, (0,)) for part in _parts(x, 0))
-
-
-def _parts(x: Array, axis: int) -> list[Array]:
-    """The components of an axis, of length one there."""
-    return list(lax.split(x, (1,) * x.shape[axis], axis))
+def components(x: Array, axis: int = 0) -> tuple[Array, ...]:
+    """The components of an axis, the inverse of `stack`."""
+    return tuple(lax.squeeze(part, (axis,)) for part in parts(x, axis))
 
 
 def matmul(a: Array, b: Array) -> Array:
@@ -63,13 +58,13 @@ def turned(R: Array, wrench: Array) -> Array:
 
 def dot(a: Array, b: Array) -> Array:
     """Scalar product of two vectors."""
-    parts = components(a * b)
-    return sum(parts[1:], parts[0])
+    first, *others = components(a * b)
+    return sum(others, first)
 
 
 def cross(a: Array, b: Array) -> Array:
     """Vector product of two vectors."""
-    (x, y, z), (u, v, w) = (_parts(p, 0) for p in (a, b))
+    (x, y, z), (u, v, w) = (parts(p, 0) for p in (a, b))
     return jnp.concatenate([y * w - z * v, z * u - x * w, x * v - y * u])
 
 
@@ -87,7 +82,7 @@ def transpose(a: Array) -> Array:
 
 def skew(v: Array) -> Array:
     r"""Matrix $\tilde v$ with $\tilde v w = v \times w$."""
-    (x, y, z), (a, b, c) = _parts(v, 0), _parts(-v, 0)
+    (x, y, z), (a, b, c) = parts(v, 0), parts(-v, 0)
     zero = jnp.zeros_like(x)
     return jnp.concatenate([zero, c, y, z, zero, a, b, x, zero]).reshape(3, 3, *v.shape[1:])
 
