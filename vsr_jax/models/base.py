@@ -19,9 +19,10 @@ from ..mechanics.coupling import ArmProblem
 from ..mechanics.reaction import Loading, loading
 from ..mechanics.resolution import COARSE, step_error
 from ..numerics.component import Forces, Vector, dot, times
-from ..numerics.magnus import step_components, step_poses, tip_pose
+from ..numerics.magnus import stacked_twist, step_poses, tip_pose
 from ..numerics.quadrature import Grid, gauss_legendre, locate, make_grid
-from ..numerics.se3 import exp_components, pose
+from ..numerics.se3 import stacked_exp, whole_pose
+from ..numerics.stacked import stack
 from ..typing import Pose, Scalar
 from .basis import unnamed
 from .refinement import Refinement, balanced_strain, corrected_strain, merged_tip
@@ -314,10 +315,8 @@ class SteppedModel(Model):
         nodes = gauss_legendre(self.order // 2)[0].astype(h.dtype)
         X_nodes = grid.start[step] + nodes[:, None] * h
         strain = self.smooth_strain(scene, forces, state, X_nodes.reshape(-1))
-        stages = tuple(
-            tuple(x.reshape(X_nodes.shape)[i] for x in strain) for i in range(len(nodes))
-        )
-        return jax.vmap(jnp.matmul)(ends[step], pose(*exp_components(step_components(stages, h))))
+        twist = stacked_twist(stack(strain).reshape(6, *X_nodes.shape), h)
+        return jax.vmap(jnp.matmul)(ends[step], whole_pose(stacked_exp(twist)))
 
 
 def resolved(model: Model, scene: Scene, outcome: Outcome) -> Outcome:

@@ -6,7 +6,6 @@ for $Y' = A Y$.
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,49 +14,47 @@ from jaxtyping import Array, Float
 
 from ..typing import Pose, Scalar, Twist
 from ..validation import choice
-from . import component as c
-from .component import Matrix, Vector
+from . import stacked
+from .component import Vector
+from .once import once
 from .se3 import (
     adjoint,
     base_pose,
-    bracket_components,
-    compose_components,
     exp,
-    exp_components,
     inverse,
-    pose,
+    stacked_bracket,
+    stacked_exp,
+    stacked_product,
     vee,
+    whole_pose,
 )
+from .stacked import stack
 
 ORDERS = (2, 4, 6)
 """Orders of the steps; order 2 s uses s Gauss points per step."""
 
 
-def step_components(stages: tuple[Vector, ...], h: Array) -> Vector:
-    r"""`step_twist` on component arrays: the twist of each step from the strains at its Gauss
-    points."""
+def stacked_twist(xi: Array, h: Array) -> Array:
+    r"""`step_twist` of the strains (6, stages, ...) at the Gauss points of steps, shape (6, ...)."""
+    stages = stacked.components(xi, axis=1)
     if len(stages) == 1:
-        return c.scale(h, stages[0])
+        return h * stages[0]
     if len(stages) == 2:
-        mean = c.scale(0.5 * h, c.add(*stages))
-        return c.add(mean, c.scale(math.sqrt(3) / 12 * h * h, bracket_components(*stages)))
+        mean = 0.5 * h * (stages[0] + stages[1])
+        return mean + math.sqrt(3) / 12 * h * h * stacked_bracket(*stages)
     first, middle, last = stages
-    a1 = c.scale(h, middle)
-    a2 = c.scale(math.sqrt(15) / 3 * h, c.subtract(last, first))
-    a3 = c.scale(10 / 3 * h, c.add(c.subtract(first, c.scale(2.0, middle)), last))
-    return magnus_6(a1, a2, a3, bracket_components)
+    a2 = math.sqrt(15) / 3 * h * (last - first)
+    a3 = 10 / 3 * h * (first - 2.0 * middle + last)
+    return magnus_6(h * middle, a2, a3, stacked_bracket)
 
 
-def magnus_6(
-    a1: c.Tree, a2: c.Tree, a3: c.Tree, bracket: Callable[[c.Tree, c.Tree], c.Tree]
-) -> c.Tree:
+def magnus_6(a1: Array, a2: Array, a3: Array, bracket: Callable[[Array, Array], Array]) -> Array:
     r"""Sixth-order Magnus expansion for the strain $(\alpha_1 + \alpha_2 x + \alpha_3 x^2) / h$, $x
-    \in [-1/2, 1/2]$ (see `step_twist`), for component arrays or arrays."""
+    \in [-1/2, 1/2]$ (see `step_twist`)."""
     c1 = bracket(a2, a1)
-    c2 = c.scale(1 / 60, bracket(a1, c.add(c.scale(2.0, a3), c1)))
-    left = c.add(c.subtract(c.scale(-20.0, a1), a3), c1)
-    inner = bracket(c.add(a2, c2), left)
-    return c.add(a1, c.add(c.scale(1 / 12, a3), c.scale(1 / 240, inner)))
+    c2 = 1 / 60 * bracket(a1, 2.0 * a3 + c1)
+    inner = bracket(a2 + c2, -20.0 * a1 - a3 + c1)
+    return a1 + 1 / 12 * a3 + 1 / 240 * inner
 
 
 def step_twist(strains: Float[Array, "stages 6"], h: Scalar) -> Twist:
@@ -81,7 +78,7 @@ def step_twist(strains: Float[Array, "stages 6"], h: Scalar) -> Twist:
     (254) ff., with the brackets reversed for $g' = g \hat\xi$.
     """
     choice("strains.shape[0]", strains.shape[0], (1, 2, 3))
-    return jnp.stack(step_components(tuple(c.split(xi) for xi in strains), h))
+    return stacked_twist(strains.T, h)
 
 
 def zanna_step(xi_1: Twist, xi_2: Twist, h: Scalar) -> Twist:
@@ -102,17 +99,20 @@ def zanna_step(xi_1: Twist, xi_2: Twist, h: Scalar) -> Twist:
     return step_twist(jnp.stack([xi_1, xi_2]), h)
 
 
-def base_components(base: Pose | None, like: Array) -> tuple[Matrix, Vector]:
-    """Rotation and position of the base as components of `like`'s shape and dtype; the identity for
-    None."""
-    matrix = base_pose(base, like.dtype)
-    rows = tuple(tuple(jnp.broadcast_to(x, like.shape) for x in row) for row in matrix[:3])
-    return tuple(row[:3] for row in rows), tuple(row[3] for row in rows)
+def _advanced(
+    strain: Vector, h: Float[Array, " steps"], base: Pose | None
+) -> tuple[Array, Array, Array]:
+    """Poses (3, 4) at the start of the first step and at the end of the last one, and those at the
+    ends of all steps, (steps, 3, 4)."""
+    increments = jnp.moveaxis(stacked_exp(once(stacked_twist(stack(strain), h))), -1, 0)
+    start = jnp.asarray(base_pose(base, h.dtype)[:3], increments.dtype)
 
+    def advance(g: Array, increment: Array) -> tuple[Array, Array]:
+        g = stacked_product(g, once(increment))
+        return g, g
 
-def _twists(strain: Vector, h: Array) -> Vector:
-    stages = strain[0].shape[0]
-    return step_components(tuple(tuple(x[i] for x in strain) for i in range(stages)), h)
+    end, ends = lax.scan(advance, start, increments)
+    return start, end, ends
 
 
 def tip_pose(strain: Vector, h: Float[Array, " steps"], base: Pose | None = None) -> Pose:
@@ -126,27 +126,15 @@ def tip_pose(strain: Vector, h: Float[Array, " steps"], base: Pose | None = None
 
     **Returns:** the pose, shape (4, 4).
     """
-    twists = _twists(strain, h)
-    start = base_components(base, twists[0][0])
-    end, _ = lax.scan(
-        lambda g, omega: (compose_components(g, exp_components(omega)), None), start, twists
-    )
-    return pose(*end)
+    return whole_pose(_advanced(strain, h, base)[1])
 
 
 def step_poses(
     strain: Vector, h: Float[Array, " steps"], base: Pose | None = None
 ) -> Float[Array, "steps_and_one 4 4"]:
     """Pose at the start and at every step end; arguments as for `tip_pose`."""
-    twists = _twists(strain, h)
-    start = base_components(base, twists[0][0])
-
-    def advance(g: Any, omega: Vector) -> tuple[Any, Any]:
-        g = compose_components(g, exp_components(omega))
-        return g, g
-
-    _, ends = lax.scan(advance, start, twists)
-    return jnp.concatenate([pose(*start)[None], pose(*ends)])
+    start, _, ends = _advanced(strain, h, base)
+    return whole_pose(jnp.moveaxis(jnp.concatenate([start[None], ends]), 0, -1))
 
 
 def step_jacobian(

@@ -3,8 +3,8 @@ the paper).
 
 A twist is $\xi = (k, u)$, a wrench $F = (M, N)$, a pose the matrix $g = \begin{pmatrix} R & r \\ 0
 & 1 \end{pmatrix}$. Every function takes one twist or one pose; batch with `jax.vmap`. The functions
-that end in `_components` are the same maps on tuples of component arrays (see `component`), for the
-kernels.
+whose names begin with `stacked_` take arrays with the components in front (see `stacked`), for the
+kernels; there a pose is the upper part (R, r) of its matrix, shape (3, 4, ...).
 """
 
 import math
@@ -17,9 +17,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..typing import Pose, Twist
-from . import component as c, stacked
-from .component import Matrix, Vector
+from . import stacked
 from .once import once
+from .stacked import columns, cross, product, rows
 
 _TERMS = 12
 """Terms of the series: the first neglected one is below double precision for $\\theta^2 < 4$."""
@@ -71,37 +71,39 @@ def _stumpff_jvp(n: int, primals: tuple[Array], tangents: tuple[Array]) -> tuple
     return (first, second), tuple(-0.5 * rate * dx for rate in rates)
 
 
-def _rotation(k: Vector, a: Array, b: Array) -> Matrix:
-    kx, ky, kz = k
-    xx, yy, zz = b * kx * kx, b * ky * ky, b * kz * kz
-    xy, xz, yz = b * kx * ky, b * kx * kz, b * ky * kz
-    ax, ay, az = a * kx, a * ky, a * kz
-    return (
-        (1.0 - yy - zz, xy - az, xz + ay),
-        (xy + az, 1.0 - xx - zz, yz - ax),
-        (xz - ay, yz + ax, 1.0 - xx - yy),
-    )
-
-
-def stacked_rotation(k: Array) -> Array:
-    r"""Rotation $\exp \tilde k = (1 - b k^2) 1 + a \tilde k + b k k^T$ of a vector (3, ...), shape
-    (3, 3, ...)."""
-    square = stacked.dot(k, k)
-    a, b, _ = exp_coefficients(square)
-    a, b = once(a), once(b)
+def _rotation(k: Array, square: Array, a: Array, b: Array) -> Array:
+    r"""$(1 - b k^2) 1 + a \tilde k + b k k^T$."""
     diagonal = (1.0 - b * square) * stacked.identity(k[None])
     return diagonal + a * stacked.skew(k) + (b * k)[:, None] * k[None]
 
 
-def exp_components(omega: Vector) -> tuple[Matrix, Vector]:
-    """`exp` on a tuple of six component arrays: the rotation as rows of components and the
-    translation."""
-    k, u = omega[:3], omega[3:]
-    a, b, c3 = exp_coefficients(c.dot(k, k))
-    ku = c.cross(k, u)
-    kku = c.cross(k, ku)
-    translation = tuple(p + b * q + c3 * s for p, q, s in zip(u, ku, kku, strict=True))
-    return _rotation(k, a, b), translation
+def stacked_rotation(k: Array) -> Array:
+    r"""Rotation $\exp \tilde k$ of a vector (3, ...), shape (3, 3, ...)."""
+    square = stacked.dot(k, k)
+    a, b, _ = exp_coefficients(square)
+    return _rotation(k, square, once(a), once(b))
+
+
+def stacked_exp(omega: Array) -> Array:
+    """`exp` of a twist (6, ...): rotation and translation, shape (3, 4, ...)."""
+    k, u = rows(omega, 0, 3), rows(omega, 3, 6)
+    square = stacked.dot(k, k)
+    a, b, c3 = (once(x) for x in exp_coefficients(square))
+    ku = once(cross(k, u))
+    translation = u + b * ku + c3 * cross(k, ku)
+    return once(jnp.concatenate([_rotation(k, square, a, b), translation[:, None]], axis=1))
+
+
+def stacked_bracket(a: Array, b: Array) -> Array:
+    r"""Lie bracket $[a, b] = \mathrm{ad}_a b$ of two twists (6, ...)."""
+    (k, u), (l, v) = ((rows(x, 0, 3), rows(x, 3, 6)) for x in (a, b))
+    return jnp.concatenate([cross(k, l), cross(k, v) + cross(u, l)])
+
+
+def stacked_product(g: Array, increment: Array) -> Array:
+    """Product of two poses (3, 4, ...)."""
+    further = product(columns(g, 0, 3), increment)
+    return further + jnp.pad(columns(g, 3, 4), [(0, 0), (3, 0), *[(0, 0)] * (g.ndim - 2)])
 
 
 def skew(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
@@ -141,11 +143,11 @@ def vee(matrix: Pose) -> Twist:
     return jnp.concatenate([unskew(matrix), matrix[:3, 3]])
 
 
-def pose(rotation: Matrix, position: Vector) -> Float[Array, "*batch 4 4"]:
-    """Matrix $g$ of shape (..., 4, 4) from the components of $R$ and $r$."""
-    zero = jnp.zeros_like(position[0])
-    rows = [(*row, x) for row, x in zip(rotation, position, strict=True)]
-    return c.join_matrix((*rows, (zero, zero, zero, zero + 1.0)))
+def whole_pose(g: Array) -> Float[Array, "*batch 4 4"]:
+    """Matrices (..., 4, 4) of poses (3, 4, ...)."""
+    upper = jnp.moveaxis(g, (0, 1), (-2, -1))
+    last = jnp.broadcast_to(jnp.asarray([[0.0, 0.0, 0.0, 1.0]], g.dtype), (*upper.shape[:-2], 1, 4))
+    return jnp.concatenate([upper, last], axis=-2)
 
 
 def base_pose(base: Array | None, dtype: Any) -> Array | np.ndarray:
@@ -163,7 +165,7 @@ def exp(omega: Twist) -> Pose:
 
     **Returns:** the pose, shape (4, 4). Derivatives are exact at $\theta = 0$ too.
     """
-    return pose(*exp_components(c.split(omega)))
+    return whole_pose(stacked_exp(omega))
 
 
 def inverse(g: Pose) -> Pose:
@@ -238,18 +240,3 @@ def coad(xi: Twist) -> Float[Array, "6 6"]:
     """
     k, u = skew(xi[:3]), skew(xi[3:])
     return _blocks(k, u, jnp.zeros_like(k), k)
-
-
-def bracket_components(a: Vector, b: Vector) -> Vector:
-    r"""Lie bracket $[a, b] = \mathrm{ad}_a b$ on tuples of six component arrays."""
-    angular = c.cross(a[:3], b[:3])
-    linear = c.add(c.cross(a[:3], b[3:]), c.cross(a[3:], b[:3]))
-    return (*angular, *linear)
-
-
-def compose_components(
-    g: tuple[Matrix, Vector], increment: tuple[Matrix, Vector]
-) -> tuple[Matrix, Vector]:
-    """Product of two poses given by the components of their rotation and translation."""
-    rotation, position = g
-    return c.matmul(rotation, increment[0]), c.add(position, c.matvec(rotation, increment[1]))
