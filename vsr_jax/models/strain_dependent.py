@@ -5,6 +5,7 @@ Without loads each node is solved alone. With loads the reaction is part of the 
 and all nodes are solved together (see `arm_balance`).
 """
 
+import math
 from typing import Any
 
 import equinox as eqx
@@ -40,6 +41,10 @@ from ..typing import Scalar
 from ..validation import choice, count
 from .base import Near, Nodes, Outcome, Status, SteppedModel, classify, rest_where_failed
 
+_LANES = 8
+"""Sections without loads are solved in multiples of so many, the numbers that a CPU works on at a
+time: 62 sections in a batch take longer than 64."""
+
 
 class StrainDependent(SteppedModel):
     r"""Strain from the balance of each cross-section, $\xi = \Sigma^{-1} (B_\tau(\xi) \tau +
@@ -73,7 +78,7 @@ class StrainDependent(SteppedModel):
         solution = solve_balance(sections, tau, None, scene.free)
         status = classify(solution.xi, sections, tau, solution.balanced, solution.definite)
         xi, sections = jax.tree.map(
-            lambda x: x[..., : grid.h.size] if x.ndim > 1 else x, (solution.xi, sections)
+            lambda x: x[: grid.X.size].reshape(grid.X.shape), (solution.xi, sections)
         )
         xi = rest_where_failed(status, xi, sections)
         nodes = Nodes(grid, xi, sections, sections.reach)
@@ -232,8 +237,8 @@ class StrainDependent(SteppedModel):
 
 
 def _with_ends(grid: Grid, length: Scalar) -> Array:
-    """Abscissas of the nodes, and behind them those of both ends of the arm, where no node lies: a
-    tapered arm fails at its tip first."""
-    stages = len(grid.X)
-    ends = length * jnp.array([[0.0], *[[1.0]] * max(1, stages - 1)], length.dtype)
-    return jnp.concatenate([grid.X, ends.reshape(stages, -1)], axis=1)
+    """Abscissas of the nodes in one axis, and behind them those of both ends of the arm, where no
+    node lies: a tapered arm fails at its tip first."""
+    beyond = _LANES * math.ceil((grid.X.size + 2) / _LANES) - grid.X.size
+    ends = length * jnp.array([0.0, *[1.0] * (beyond - 1)], length.dtype)
+    return jnp.concatenate([grid.X.reshape(-1), ends])

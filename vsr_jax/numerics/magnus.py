@@ -35,7 +35,7 @@ ORDERS = (2, 4, 6)
 
 
 def stacked_twist(xi: Array, h: Array) -> Array:
-    r"""`step_twist` of the strains (6, stages, ...) at the Gauss points of steps, shape (6, ...)."""
+    r"""`step_twist` of strains (6, stages, ...) at the Gauss points of steps, shape (6, ...)."""
     stages = stacked.components(xi, axis=1)
     if len(stages) == 1:
         return h * stages[0]

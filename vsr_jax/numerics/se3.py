@@ -96,8 +96,8 @@ def stacked_exp(omega: Array) -> Array:
 
 def stacked_bracket(a: Array, b: Array) -> Array:
     r"""Lie bracket $[a, b] = \mathrm{ad}_a b$ of two twists (6, ...)."""
-    (k, u), (l, v) = ((rows(x, 0, 3), rows(x, 3, 6)) for x in (a, b))
-    return jnp.concatenate([cross(k, l), cross(k, v) + cross(u, l)])
+    (turn, slide), (other, along) = ((rows(x, 0, 3), rows(x, 3, 6)) for x in (a, b))
+    return jnp.concatenate([cross(turn, other), cross(turn, along) + cross(slide, other)])
 
 
 def stacked_product(g: Array, increment: Array) -> Array:
