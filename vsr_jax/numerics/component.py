@@ -76,9 +76,12 @@ def _product(a: Array | float, b: Array) -> Array:
 
 
 def select(condition: Array, a: Tree, b: Tree) -> Tree:
-    """`a` where the condition holds and `b` elsewhere, component by component."""
+    """`a` where the condition holds and `b` elsewhere, component by component; what is the same in
+    both costs no operation."""
 
     def chosen(x: Array, y: Array) -> Array:
+        if x is y and jnp.broadcast_shapes(condition.shape, x.shape) == x.shape:
+            return x
         alike = _alike(x, y) and condition.shape == x.shape
         return lax.select(condition, x, y) if alike else jnp.where(condition, x, y)
 
