@@ -1,4 +1,5 @@
-"""Products of small matrices: values and derivatives of both modes against `einsum`."""
+"""Products of small matrices and of vectors: values and derivatives of both modes against `einsum`
+and `numpy.cross`."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +7,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from vsr_jax.numerics.small_product import product
+from vsr_jax.numerics.small_product import cross, product
 
 PLACES = {
     "alike": ((5, 2), (5, 2)),
@@ -63,6 +64,43 @@ def test_a_derivative_in_reverse_mode_is_a_product_each():
     assert [e.primitive.name for e in back.eqns] == ["small_product"] * 3
 
 
+def by_jax(a, b):
+    return jnp.moveaxis(jnp.cross(*(jnp.moveaxis(x, 0, -1) for x in (a, b))), -1, 0)
+
+
+@pytest.mark.parametrize("places", PLACES.values(), ids=PLACES)
+def test_vector_products_and_their_derivatives_are_those_of_numpy(places):
+    a, b = (drawn(i, 3, *shape) for i, shape in enumerate(places))
+    expected = np.moveaxis(np.cross(*(np.moveaxis(x, 0, -1) for x in (a, b))), -1, 0)
+    np.testing.assert_allclose(cross(a, b), expected, rtol=1e-13, atol=1e-15)
+    check_grads(lambda a, b: cross(jnp.asarray(a), jnp.asarray(b)), (a, b), 2, atol=1e-7, rtol=1e-7)
+    for one, other in zip(
+        jax.jacrev(cross, (0, 1))(a, b), jax.jacfwd(by_jax, (0, 1))(a, b), strict=True
+    ):
+        np.testing.assert_allclose(one, other, rtol=1e-13, atol=1e-15)
+
+
+@pytest.mark.parametrize("axes", [(0, None), (None, 0), (1, 0), (0, 2)])
+def test_a_batch_of_vector_products_is_the_loop(axes):
+    a, b = (
+        drawn(i, 3, 5) if axis is None else drawn(i, *(3, 5)[:axis], 6, *(3, 5)[axis:])
+        for i, axis in enumerate(axes)
+    )
+    found = jax.vmap(cross, axes)(a, b)
+    for i in range(6):
+        one, other = (
+            x if axis is None else jnp.take(x, i, axis)
+            for x, axis in zip((a, b), axes, strict=True)
+        )
+        np.testing.assert_allclose(found[i], by_jax(one, other), rtol=1e-13, atol=1e-15)
+
+
 def test_matrices_that_do_not_fit_are_refused():
     with pytest.raises(TypeError, match=r"no product of matrices of shapes \(2, 3\) and \(2, 3\)"):
         jax.jit(product)(jnp.ones((2, 3)), jnp.ones((2, 3)))
+
+
+def test_vectors_that_do_not_fit_are_refused():
+    for shapes in (((3,), (3, 2)), ((2,), (2,))):
+        with pytest.raises(TypeError, match="no product of vectors of shapes"):
+            jax.jit(cross)(*(jnp.ones(shape) for shape in shapes))

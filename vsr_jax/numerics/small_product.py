@@ -1,11 +1,13 @@
-"""Products of small matrices with their components in the first axes, as one operation of a program
-each, as `lax.dot_general` is one: its derivatives in reverse mode are products again, where those
-of multiplications and sums would be three times as many operations, to be traced and compiled.
+"""Products of small matrices and of vectors with their components in the first axes, as one
+operation of a program each, as `lax.dot_general` is one: its derivatives in reverse mode are
+products again, where those of multiplications and sums would be three times as many operations, to
+be traced and compiled.
 
-XLA has no such product: `dot_general` with hundreds of arms or nodes behind the components calls a
+XLA has no such products: `dot_general` with hundreds of arms or nodes behind the components calls a
 library for each of them.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
@@ -36,8 +38,18 @@ def total(x: Array, axis: int) -> Array:
 
 def product(a: Array, b: Array) -> Array:
     """Product of the matrices (n, k, ...) and (k, m, ...)."""
+    return _product.bind(*_alike(a, b), lead=0, of=(1, 0))
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Vector product of two vectors (3, ...)."""
+    return _cross.bind(*_alike(a, b), lead=0)
+
+
+def _alike(a: Array, b: Array) -> tuple[Array, Array]:
+    """Both factors in the higher one of their precisions."""
     dtype = jnp.promote_types(a.dtype, b.dtype)
-    return _product.bind(a.astype(dtype), b.astype(dtype), lead=0, of=(1, 0))
+    return a.astype(dtype), b.astype(dtype)
 
 
 def _contracted(a: Any, b: Any, *, lead: int, of: tuple[int, int]) -> Array:
@@ -77,25 +89,51 @@ def _by_second(back: Any, a: Any, b: Any, *, lead: int, of: tuple[int, int]) -> 
     return _summed_to(b.aval.shape, found)
 
 
+def _crossed(a: Any, b: Any, *, lead: int) -> Array:
+    (x, y, z), (u, v, w) = (parts(p, lead) for p in (a, b))
+    return jnp.concatenate([y * w - z * v, z * u - x * w, x * v - y * u], axis=lead)
+
+
+def _cross_shape(a: ShapedArray, b: ShapedArray, *, lead: int) -> ShapedArray:
+    if len(a.shape) != len(b.shape) or not a.shape[lead] == b.shape[lead] == 3:
+        raise TypeError(f"no product of vectors of shapes {a.shape} and {b.shape}")
+    return ShapedArray(np.broadcast_shapes(a.shape, b.shape), a.dtype)
+
+
+def _cross_by_first(back: Any, a: Any, b: Any, *, lead: int) -> Array:
+    return _summed_to(a.aval.shape, _cross.bind(b, back, lead=lead))
+
+
+def _cross_by_second(back: Any, a: Any, b: Any, *, lead: int) -> Array:
+    return _summed_to(b.aval.shape, _cross.bind(back, a, lead=lead))
+
+
 def _summed_to(shape: tuple[int, ...], x: Array) -> Array:
     """Sum over the axes along which a factor of a shape was repeated."""
     axes = tuple(i for i, (one, all) in enumerate(zip(shape, x.shape, strict=True)) if one != all)
     return jnp.sum(x, axes, keepdims=True) if axes else x
 
 
-def _batched(
-    factors: tuple[Array, Array], axes: tuple, *, lead: int, of: tuple[int, int]
-) -> tuple[Array, int]:
-    a, b = (
-        x[None] if axis is None else jnp.moveaxis(x, axis, 0)
-        for x, axis in zip(factors, axes, strict=True)
-    )
-    return _product.bind(a, b, lead=lead + 1, of=of), 0
+def _primitive(
+    name: str, value: Callable, shape: Callable, by_first: Callable, by_second: Callable
+) -> Primitive:
+    """A product as an operation, from its value and shape and the parts of its transpose."""
+    made = Primitive(name)
+
+    def batched(factors: tuple[Array, Array], axes: tuple, **how: Any) -> tuple[Array, int]:
+        a, b = (
+            x[None] if axis is None else jnp.moveaxis(x, axis, 0)
+            for x, axis in zip(factors, axes, strict=True)
+        )
+        return made.bind(a, b, **(how | {"lead": how["lead"] + 1})), 0
+
+    made.def_impl(value)
+    made.def_abstract_eval(shape)
+    ad.defbilinear(made, by_first, by_second)
+    batching.primitive_batchers[made] = batched
+    mlir.register_lowering(made, mlir.lower_fun(value, multiple_results=False))
+    return made
 
 
-_product = Primitive("small_product")
-_product.def_impl(_contracted)
-_product.def_abstract_eval(_shape)
-ad.defbilinear(_product, _by_first, _by_second)
-batching.primitive_batchers[_product] = _batched
-mlir.register_lowering(_product, mlir.lower_fun(_contracted, multiple_results=False))
+_product = _primitive("small_product", _contracted, _shape, _by_first, _by_second)
+_cross = _primitive("cross_product", _crossed, _cross_shape, _cross_by_first, _cross_by_second)

@@ -12,7 +12,7 @@ from jax import lax
 from jaxtyping import Array
 
 from .once import once
-from .small_product import parts, product as product, total as total
+from .small_product import cross as cross, parts, product as product, total as total
 
 
 def stack(components: tuple[Array, ...], axis: int = 0) -> Array:
@@ -58,14 +58,7 @@ def turned(R: Array, wrench: Array) -> Array:
 
 def dot(a: Array, b: Array) -> Array:
     """Scalar product of two vectors."""
-    first, *others = components(a * b)
-    return sum(others, first)
-
-
-def cross(a: Array, b: Array) -> Array:
-    """Vector product of two vectors."""
-    (x, y, z), (u, v, w) = (parts(p, 0) for p in (a, b))
-    return jnp.concatenate([y * w - z * v, z * u - x * w, x * v - y * u])
+    return total(a * b, 0)
 
 
 def affine(a: Array, v: Array) -> Array:
@@ -93,15 +86,13 @@ def identity(like: Array) -> Array:
 
 
 def adjugate(a: Array) -> tuple[Array, Array]:
-    """Adjugate and determinant of a matrix of three rows; their quotient is the inverse."""
-    twice = jnp.concatenate([a, a])
-    twice = jnp.concatenate([twice, twice], axis=1)
+    """Adjugate and determinant of a matrix of three rows; their quotient is the inverse.
 
-    def shifted(i: int, j: int) -> Array:
-        return columns(rows(twice, i, i + 3), j, j + 3)
-
-    cofactors = once(shifted(1, 1) * shifted(2, 2) - shifted(1, 2) * shifted(2, 1))
-    return transpose(cofactors), dot(a[0], cofactors[0])
+    The columns of the adjugate are the vector products of the rows, in cyclic order."""
+    first, second, third = parts(transpose(a), 1)
+    columns = cross(second, third), cross(third, first), cross(first, second)
+    found = once(jnp.concatenate(columns, axis=1))
+    return found, dot(a[0], found[:, 0])
 
 
 def trace(a: Array) -> Array:
