@@ -90,7 +90,7 @@ def _by_second(back: Any, a: Any, b: Any, *, lead: int, of: tuple[int, int]) -> 
 
 
 def _crossed(a: Any, b: Any, *, lead: int) -> Array:
-    (x, y, z), (u, v, w) = (parts(p, lead) for p in (a, b))
+    (x, y, z), (u, v, w) = (parts(jnp.asarray(p), lead) for p in (a, b))
     return jnp.concatenate([y * w - z * v, z * u - x * w, x * v - y * u], axis=lead)
 
 
