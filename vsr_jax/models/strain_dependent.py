@@ -5,7 +5,6 @@ Without loads each node is solved alone. With loads the reaction is part of the 
 and all nodes are solved together (see `arm_balance`).
 """
 
-import math
 from typing import Any
 
 import equinox as eqx
@@ -26,6 +25,7 @@ from ..mechanics.arm_solve import solve_arm
 from ..mechanics.balance import (
     forces_where,
     free_components,
+    newton_step,
     residual,
     solve_balance,
     spread,
@@ -37,13 +37,8 @@ from ..mechanics.reaction import Loading, react_at
 from ..numerics.component import Forces, Vector
 from ..numerics.magnus import ORDERS
 from ..numerics.quadrature import Grid
-from ..typing import Scalar
 from ..validation import choice, count
 from .base import Near, Nodes, Outcome, Status, SteppedModel, classify, rest_where_failed
-
-_LANES = 8
-"""Sections without loads are solved in multiples of so many, the numbers that a CPU works on at a
-time: 62 sections in a batch take longer than 64."""
 
 
 class StrainDependent(SteppedModel):
@@ -73,14 +68,14 @@ class StrainDependent(SteppedModel):
         if scene.coupled:
             return self._solve_together(scene, problem_of(scene, inputs, self.grid(scene)))
         grid = self.grid(scene)
-        sections, forces = scene.sections(_with_ends(grid, scene.rod.length)), scene.forces(inputs)
+        sections, forces = scene.sections(grid.X), scene.forces(inputs)
         tau = sections.carry(forces)
         solution = solve_balance(sections, tau, None, scene.free)
         status = classify(solution.xi, sections, tau, solution.balanced, solution.definite)
-        xi, sections = jax.tree.map(
-            lambda x: x[: grid.X.size].reshape(grid.X.shape), (solution.xi, sections)
+        status = jnp.where(
+            status == Status.CONVERGED, _status_of_ends(scene, forces, solution.xi), status
         )
-        xi = rest_where_failed(status, xi, sections)
+        xi = rest_where_failed(status, solution.xi, sections)
         nodes = Nodes(grid, xi, sections, sections.reach)
         return Outcome(ArmSolution(xi, (), ()), forces, status, solution.steps, nodes)
 
@@ -236,9 +231,15 @@ class StrainDependent(SteppedModel):
         return tuple(found.astype(x.dtype) * x for x in xi)
 
 
-def _with_ends(grid: Grid, length: Scalar) -> Array:
-    """Abscissas of the nodes in one axis, and behind them those of both ends of the arm, where no
-    node lies: a tapered arm fails at its tip first."""
-    beyond = _LANES * math.ceil((grid.X.size + 2) / _LANES) - grid.X.size
-    ends = length * jnp.array([0.0, *[1.0] * (beyond - 1)], length.dtype)
-    return jnp.concatenate([grid.X.reshape(-1), ends])
+def _status_of_ends(scene: Scene, forces: Forces, xi: Vector) -> Array:
+    """Status of the two ends of the arm, where no node lies: a tapered arm fails at its tip first.
+    One Newton step from the strain at the nearest node is accurate enough."""
+    sections = scene.sections(jnp.stack([jnp.zeros_like(scene.rod.length), scene.rod.length]))
+    tau = sections.carry(forces)
+    beside = lax.stop_gradient(tuple(jnp.stack([x[0, 0], x[-1, -1]]) for x in xi))
+    _, step = newton_step(beside, sections, tau, None, scene.free)
+    definite = ~jnp.isnan(step[-1])
+    there = tuple(
+        jnp.where(definite, x - s, x) for x, s in zip(beside, spread(step, scene.free), strict=True)
+    )
+    return classify(there, sections, tau, jnp.ones_like(definite), definite)
