@@ -144,3 +144,14 @@ def test_rotation_vectors_have_derivatives_up_to_half_a_turn():
             lambda k: se3.rotation_vector(se3.exp(jnp.append(k, jnp.zeros(3)))[:3, :3])
         )(at)
         np.testing.assert_allclose(slope, np.eye(3), atol=1e-10)
+
+
+@pytest.mark.parametrize("batch", [(), (5,), (2, 3)])
+def test_a_pose_is_put_together_from_arrays_or_components(batch):
+    rng = np.random.default_rng(0)
+    R, r = jnp.asarray(rng.normal(size=(3, 3, *batch))), jnp.asarray(rng.normal(size=(3, *batch)))
+    found = se3.pose(R, r)
+    np.testing.assert_array_equal(found[..., :3, :3], jnp.moveaxis(R, (0, 1), (-2, -1)))
+    np.testing.assert_array_equal(found[..., :3, 3], jnp.moveaxis(r, 0, -1))
+    np.testing.assert_array_equal(found[..., 3, :], np.broadcast_to([0, 0, 0, 1], (*batch, 4)))
+    np.testing.assert_array_equal(se3.pose(tuple(map(tuple, R)), tuple(r)), found)

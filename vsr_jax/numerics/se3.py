@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 
 from ..typing import Pose, Twist
 from . import stacked
+from .component import Matrix, Vector
 from .once import once
 from .stacked import columns, cross, product, rows
 
@@ -71,9 +72,9 @@ def _stumpff_jvp(n: int, primals: tuple[Array], tangents: tuple[Array]) -> tuple
     return (first, second), tuple(-0.5 * rate * dx for rate in rates)
 
 
-def _rotation(k: Array, square: Array, a: Array, b: Array) -> Array:
-    r"""$(1 - b k^2) 1 + a \tilde k + b k k^T$."""
-    diagonal = (1.0 - b * square) * stacked.identity(k[None])
+def _rotation(k: Array, cosine: Array, a: Array, b: Array) -> Array:
+    r"""$\cos\theta \, 1 + a \tilde k + b k k^T$ of a vector with the norm $\theta$."""
+    diagonal = cosine * stacked.identity(k[None])
     return diagonal + a * stacked.skew(k) + (b * k)[:, None] * k[None]
 
 
@@ -81,7 +82,8 @@ def stacked_rotation(k: Array) -> Array:
     r"""Rotation $\exp \tilde k$ of a vector (3, ...), shape (3, 3, ...)."""
     square = stacked.dot(k, k)
     a, b, _ = exp_coefficients(square)
-    return _rotation(k, square, once(a), once(b))
+    a, b = once(a), once(b)
+    return _rotation(k, 1.0 - b * square, a, b)
 
 
 def stacked_exp(omega: Array) -> Array:
@@ -91,7 +93,9 @@ def stacked_exp(omega: Array) -> Array:
     a, b, c3 = (once(x) for x in exp_coefficients(square))
     ku = once(cross(k, u))
     translation = u + b * ku + c3 * cross(k, ku)
-    return once(jnp.concatenate([_rotation(k, square, a, b), translation[:, None]], axis=1))
+    # rounded by itself: else the last bit depends on whether a batch is alone or in a loop
+    cosine = once(1.0 - b * square)
+    return once(jnp.concatenate([_rotation(k, cosine, a, b), translation[:, None]], axis=1))
 
 
 def stacked_bracket(a: Array, b: Array) -> Array:
@@ -141,6 +145,13 @@ def vee(matrix: Pose) -> Twist:
     **Returns:** $\xi = (k, u)$, shape (6,).
     """
     return jnp.concatenate([unskew(matrix), matrix[:3, 3]])
+
+
+def pose(rotation: Array | Matrix, position: Array | Vector) -> Float[Array, "*batch 4 4"]:
+    """Matrix $g$ of shape (..., 4, 4) from the components of $R$, shape (3, 3, ...), and of $r$,
+    shape (3, ...), arrays or tuples of arrays."""
+    R, r = jnp.asarray(rotation), jnp.asarray(position)
+    return whole_pose(jnp.concatenate([R, r[:, None]], axis=1))
 
 
 def whole_pose(g: Array) -> Float[Array, "*batch 4 4"]:
