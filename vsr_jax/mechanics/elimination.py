@@ -116,8 +116,7 @@ def _step_by_step(
 
     def backward(end: tuple, step: tuple) -> tuple[tuple, tuple]:
         maps, given, jump, cut = jax.tree.map(once, step)
-        link = Link(*parted(maps), *parted(given), jump, cut)
-        start, (joint, negative) = join(end, link)
+        start, (joint, negative) = join(end, Link(*parted(maps), *parted(given), jump, cut))
         maps = jnp.concatenate([joint.turn, joint.wrench, rows(start[0], 0, 3)])
         return start, (maps, jnp.concatenate([joint.turned, joint.pulled]), negative)
 
@@ -126,7 +125,7 @@ def _step_by_step(
     maps, given = _moved((maps, given), 0, -1)
     (turn, wrench), (turned_end, pulled) = parted(maps), parted(given)
     joint = Joint(turn, turned_end, wrench, pulled)
-    theta = _rotations(*_moved((turn, turned_end, link.joined), -1, 0), end)
+    theta = _rotations(*_moved((turn, turned_end, link.joined), -1, 0))
     asymmetry = step.asymmetry(rows(maps, 3 + size, 6 + size))
     signs = negative + local, stable, asymmetry
     return by_start(nodes, sections, step, joint), theta, signs
@@ -149,18 +148,19 @@ def _node_by_node(
 
     _, (strain, turn, turned_end, signs) = lax.scan(backward, end, places, reverse=True)
     joined = None if nodes.joined is None else nodes.joined[places]
-    theta = _rotations(turn, turned_end, joined, end)
+    theta = _rotations(turn, turned_end, joined)
     return _moved(strain, 0, last), theta, signs
 
 
-def _rotations(turn: Array, more: Array, joined: Array | None, end: tuple[Array, Array]) -> Array:
+def _rotations(turn: Array, more: Array, joined: Array | None) -> Array:
     """Rotations at the starts of the steps, from the base on."""
+    none = jnp.zeros(more.shape[1:], more.dtype)
 
     def forward(theta: Array, step: tuple) -> tuple[Array, Array]:
         turn, more, joined = jax.tree.map(once, step)
         return c.times(joined, matvec(turn, theta) + more), theta
 
-    return lax.scan(forward, rows(end[1], 0, 3), (turn, more, joined))[1]
+    return lax.scan(forward, none, (turn, more, joined))[1]
 
 
 def _nodes(

@@ -32,9 +32,8 @@ class StepNodes(NamedTuple):
     of the loads at the end of the step by rotations, None where there are none; `flexible` of the
     sections.
 
-    Behind the components come the axis of the nodes (but for h, `jump` and
-    `joined`) and those of steps or
-    arms.
+    Behind the components come the axis of the nodes (but for h, `jump` and `joined`) and those of
+    steps or arms.
     """
 
     h: Array

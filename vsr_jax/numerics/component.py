@@ -140,17 +140,6 @@ def matvec(matrix: Matrix, vector: Vector) -> Vector:
     return tuple(dot(row, vector) for row in matrix)
 
 
-def transpose(matrix: Matrix) -> Matrix:
-    """Transposed matrix."""
-    return tuple(zip(*matrix, strict=True))
-
-
-def matmul(a: Matrix, b: Matrix) -> Matrix:
-    """Product of two matrices."""
-    columns = transpose(b)
-    return tuple(tuple(dot(row, column) for column in columns) for row in a)
-
-
 def cholesky(lower: Matrix) -> Matrix:
     """Cholesky factor $L$, $A = L L^T$, of a symmetric matrix, unrolled.
 

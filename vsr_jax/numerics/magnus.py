@@ -14,7 +14,6 @@ from jaxtyping import Array, Float
 
 from ..typing import Pose, Scalar, Twist
 from ..validation import choice
-from . import stacked
 from .component import Vector
 from .once import once
 from .se3 import (
@@ -28,7 +27,7 @@ from .se3 import (
     vee,
     whole_pose,
 )
-from .stacked import stack
+from .stacked import components, stack
 
 ORDERS = (2, 4, 6)
 """Orders of the steps; order 2 s uses s Gauss points per step."""
@@ -36,7 +35,7 @@ ORDERS = (2, 4, 6)
 
 def stacked_twist(xi: Array, h: Array) -> Array:
     r"""`step_twist` of strains (6, stages, ...) at the Gauss points of steps, shape (6, ...)."""
-    stages = stacked.components(xi, axis=1)
+    stages = components(xi, axis=1)
     if len(stages) == 1:
         return h * stages[0]
     if len(stages) == 2:

@@ -90,8 +90,8 @@ def adjugate(a: Array) -> tuple[Array, Array]:
 
     The columns of the adjugate are the vector products of the rows, in cyclic order."""
     first, second, third = parts(transpose(a), 1)
-    columns = cross(second, third), cross(third, first), cross(first, second)
-    found = once(jnp.concatenate(columns, axis=1))
+    products = cross(second, third), cross(third, first), cross(first, second)
+    found = once(jnp.concatenate(products, axis=1))
     return found, dot(a[0], found[:, 0])
 
 
