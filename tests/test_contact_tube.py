@@ -4,6 +4,7 @@ tube, against the theory of small deflections.
 Lengths are per length L of the arm, forces in $EI / L^2$; r is the clearance, by which the axis may
 move aside."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -179,3 +180,30 @@ def test_an_arm_that_has_buckled_into_a_helix(clearance):
     np.testing.assert_allclose(around, np.sin(angle) / clearance, rtol=5e-4)
     force = eq.contacts.force.reshape(steps, 2).sum(1)[20:26] * steps / L
     np.testing.assert_allclose(force, EI * np.sin(angle) ** 4 / clearance**3, rtol=2e-3)
+
+
+@pytest.mark.slow
+def test_an_arm_that_would_snap_aside_is_found_aside():
+    """Two tendons bend an arm in the plane between them, where its tip comes to the wall; what is
+    symmetric stays in that plane, and is unstable there."""
+    length, radius = 0.2, 0.005
+    arm = vsr.Rod(length, vsr.Circular(radius), vsr.Material(2e5, poisson=0.4))
+    tendons = [vsr.Tendon(vsr.Parallel(y, z)) for y, z in ((0.003, 0.0), (0.0, 0.003))]
+
+    @jax.jit
+    @jax.vmap
+    def solved(clearance, tensions):
+        tube = vsr.Tube(radius + clearance)
+        scene = vsr.Scene(arm, tendons, obstacles=tube)
+        eq = vsr.solve(scene, tensions, model=vsr.StrainDependent(24))
+        return eq.status, eq.stability, eq.position(jnp.linspace(0.0, length, 41))
+
+    tensions = np.array([[0.9546, 0.4999], [0.3255, 0.994], [0.8768, 0.6017]])
+    clearance = radius / np.array([0.3998, 0.7068, 0.5322]) - radius
+    status, margin, axis = solved(jnp.asarray(clearance), jnp.asarray(tensions))
+    assert np.all(status == vsr.Status.CONVERGED)
+    assert margin.min() > 0.01
+    across = np.stack([-tensions[:, 1], tensions[:, 0]], 1)
+    across /= np.linalg.norm(across, axis=1)[:, None]
+    aside = np.abs(np.einsum("axi,ai->ax", axis[..., 1:], across)).max(1)
+    assert np.all(aside > 0.03 * clearance)

@@ -109,10 +109,11 @@ class Tube(Obstacle):
     def directions(
         self, point: Position, heading: Position, lengths: Float[Array, " steps"]
     ) -> Float[Array, "steps 3"] | None:
+        turn = jnp.eye(3, dtype=lengths.dtype) if self.pose is None else self.pose[:3, :3]
         if self.line is None:
-            return None
+            along = jnp.sign(turn[:, 0] @ heading) * turn[:, 0]
+            return jnp.broadcast_to(along, (lengths.size, 3))
         curve = curve_through(self.line, self.radius)
-        turn = jnp.eye(3, dtype=self.line.dtype) if self.pose is None else self.pose[:3, :3]
         start, _ = _nearest(curve, local_point(self.pose, point))
         forth = jnp.sign(turn @ curve.at(start)[1] @ heading)
 

@@ -46,6 +46,10 @@ _LANES, _QUEUED = 48, 1024
 """Arms with constraints that are solved at a time on a CPU, and those that wait in one queue, at
 most: some need four times as many steps as most."""
 
+_BOW = 0.05
+"""Angle [rad] by which an arm with loosened constraints is bent and twisted at rest until they are
+exact: without, symmetric arms that are unstable are found in place of those beside them."""
+
 _START_STEPS = 4
 """Fixed-point steps to the start: each gains a factor of the strains that threads cause."""
 
@@ -266,6 +270,9 @@ def _iteration(
 
     def evaluate(point: _Point, damping: Array, share: Array, loose: Array) -> Damped:
         problem = whole.loosened(loose).with_share(share)
+        if whole.softens and guess is None:
+            soft = jnp.clip(2.0 - share, 0.0, 1.0)
+            problem = problem.bowed(jnp.where(loose, _BOW * soft, 0.0))
         unknown = _unknown(point, whole, free)
         imbalance, changes, at = _linearized(unknown, problem, free)
         step, definite, doubtful = approximate_solve(unknown, at, imbalance, problem, free, damping)

@@ -21,6 +21,7 @@ from typing import Any, ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, PyTree
 
 from ..arm.scene import CrossSections, Scene
@@ -31,6 +32,9 @@ from .balance import without_force
 from .border import Border, listed
 from .point_forces import PointForces
 from .reaction import Loading, Reaction
+
+_BOW_TURN = 2.4
+"""Angle [rad] by which the plane of bending of `ArmProblem.bowed` turns along the arm."""
 
 SOFTENED = (SOFT_STAGES - 0.5) / HARDENING_STAGES
 """Hardness from which constraints have no energy."""
@@ -73,6 +77,17 @@ class ArmProblem(NamedTuple):
         if loose is None or not self.softens:
             return self
         return self._replace(couplings=tuple(one.loosened(loose) for one in self.couplings))
+
+    def bowed(self, angle: Array) -> "ArmProblem":
+        """The problem of an arm that is twisted by an angle [rad] at rest, and bent by as much in a
+        plane that turns along it. What is in balance by symmetry alone is not with such a rest
+        strain."""
+        rest, steps = self.sections.rest, len(self.grid.h)
+        turn = np.linspace(0.0, _BOW_TURN, steps).reshape(steps, *(1,) * angle.ndim)
+        bow = angle / self.length
+        ways = (np.ones_like(turn), np.cos(turn), np.sin(turn))
+        bowed = (x + bow * way.astype(bow.dtype) for x, way in zip(rest[:3], ways, strict=True))
+        return self._replace(sections=self.sections._replace(rest=(*bowed, *rest[3:])))
 
     def as_loose_as(self, others: tuple["Coupling", ...]) -> "ArmProblem":
         """The problem with its couplings loosened as those of one that it begins from."""
