@@ -109,6 +109,7 @@ def test_derivatives_of_the_margins_of_an_arm_that_touches():
     np.testing.assert_allclose(slope, np.transpose(differences), rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_design_comes_free_of_an_obstacle():
     """The tip is to go where only an arm inside the ball brings it."""
     aim = vsr.objective.TipError(bare(INTO).tip[None, :3, 3])

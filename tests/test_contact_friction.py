@@ -140,6 +140,7 @@ def test_one_equilibrium_has_no_friction():
     assert not np.any(rough.contacts.friction)
 
 
+@pytest.mark.slow
 def test_a_path_goes_on_from_an_equilibrium():
     whole = vsr.follow(arm(0.3), PATH[:, None], model=MODEL)
     middle = jax.tree.map(lambda x: x[7], whole)

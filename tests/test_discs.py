@@ -96,6 +96,7 @@ def test_many_discs_approach_the_path_at_second_order():
     np.testing.assert_allclose(orders, 2.0, atol=0.1)
 
 
+@pytest.mark.slow
 def test_few_steps_between_discs_converge_with_their_order():
     fine = vsr.solve(scene(discs=3), TENSIONS, model=FINE, throw=True)
     errors = []

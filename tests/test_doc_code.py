@@ -26,8 +26,11 @@ ELSEWHERE = {
     DOCS / "live_view.md",
 }
 SLOW = {
-    DOCS / "guides" / f"{name}.md"
-    for name in ("catheter", "pneumatic_arm", "calibrate", "design", "obstacles")
+    *(
+        DOCS / "guides" / f"{name}.md"
+        for name in ("catheter", "pneumatic_arm", "calibrate", "design", "obstacles")
+    ),
+    DOCS / "api" / "obstacles.md",
 }
 """Arms under loads, fits and designs compile for long."""
 BLOCK = re.compile(

@@ -72,14 +72,19 @@ def error(loads, order, steps=16):
 
 
 @pytest.mark.parametrize("name", LOADS)
-@pytest.mark.parametrize(("order", "bound"), [(2, 1e-2), (4, 3e-4), (6, 3e-5)])
+@pytest.mark.parametrize(
+    ("order", "bound"),
+    [pytest.param(2, 1e-2, marks=pytest.mark.slow), (4, 3e-4), (6, 3e-5)],
+)
 def test_it_is_that_of_the_collocation(name, order, bound):
     """Cells by the midpoint rule, one per node, were off by a few percent at orders 4 and 6."""
     assert error(LOADS[name], order) < bound
 
 
 @pytest.mark.parametrize("name", BY_POSITION)
-@pytest.mark.parametrize(("order", "ratio"), [(2, 0.27), (4, 0.52)])
+@pytest.mark.parametrize(
+    ("order", "ratio"), [(2, 0.27), pytest.param(4, 0.52, marks=pytest.mark.slow)]
+)
 def test_by_positions_it_converges_with_the_cells(name, order, ratio):
     """Each node is a cell of its own then, which only at order 2 has the node in its middle."""
     coarse, fine = (error(BY_POSITION[name], order, steps) for steps in (16, 32))

@@ -53,7 +53,7 @@ def test_an_arm_in_a_plane_may_be_held_across_it(free):
     np.testing.assert_allclose(eq.supports[0, 5], 5e-5, rtol=1e-4)
 
 
-@pytest.mark.parametrize("along", [None, (1.0, 0.0, 0.5)])
+@pytest.mark.parametrize("along", [None, pytest.param((1.0, 0.0, 0.5), marks=pytest.mark.slow)])
 def test_an_arm_in_a_plane_is_held_alike_wherever_the_plane_lies(along):
     """Nothing can move across the plane; no support then pushes there, about no axis in it."""
     place, turn = np.array([0.7 * L, 0, -0.4 * L]), Rotation.from_rotvec([0, 0.8, 0]).as_matrix()
@@ -79,6 +79,7 @@ def test_an_arm_in_a_plane_is_held_alike_wherever_the_plane_lies(along):
     assert np.abs(support[0][[0, 1, 1], [1, 0, 2]]).min() > 1e-4
 
 
+@pytest.mark.slow
 def test_a_rigid_piece_may_be_held_twice():
     """Both supports exert together what the one at its end exerts alone."""
     arm = rod(rigid=[vsr.RigidPiece(0.12, L)])
