@@ -21,7 +21,8 @@ import numpy as np
 
 import vsr_jax as vsr
 from vsr_jax.mechanics.balance import residual
-from vsr_jax.mechanics.reaction import loading, react
+from vsr_jax.mechanics.loading import loading
+from vsr_jax.mechanics.reaction import react
 from vsr_jax.solution.equilibrium import Equilibrium
 from vsr_jax.solution.stability import extreme
 from vsr_jax.studies.timing import Timed, machine, primitives, take_turns

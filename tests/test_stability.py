@@ -17,7 +17,8 @@ from vsr_jax.mechanics.balance import (
     thread_wrench,
     with_locked,
 )
-from vsr_jax.mechanics.reaction import loading, react
+from vsr_jax.mechanics.loading import loading
+from vsr_jax.mechanics.reaction import react
 from vsr_jax.models.base import Nodes
 from vsr_jax.numerics import lanczos
 from vsr_jax.numerics.lanczos import Operator, extreme_pairs

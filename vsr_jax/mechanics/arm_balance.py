@@ -21,7 +21,8 @@ from .contact_scales import contacts_of
 from .coupling import ArmProblem, ArmState, Carried, Coupling, Shares, forces_at, loads_with
 from .friction import friction_of
 from .held import holds_of
-from .reaction import Loading, loading, react
+from .loading import Loading, loading
+from .reaction import react
 from .sizes import pull_of, shape_of, shape_size
 
 

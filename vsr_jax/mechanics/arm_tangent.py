@@ -21,9 +21,10 @@ from .border import Border, bordered_solve
 from .coupling import ArmProblem, ArmState, borders_of, points_of
 from .elimination import eliminate
 from .elimination_nodes import Definiteness
+from .loading import Loading
 from .point_forces import PointForces
 from .pose_elimination import eliminate_poses, motions
-from .reaction import Loading, Reaction, Slopes, slopes_of
+from .reaction import Reaction, Slopes, slopes_of
 from .sizes import node_weight
 from .sliding import sliding_of
 from .springs import Solve, solve_both, with_springs

@@ -25,7 +25,8 @@ from .balance import largest_force_scale, thread_direction, thread_wrench
 from .border import Border
 from .chords import Pull, discs_of
 from .coupling import ArmProblem, ArmState, Coupling
-from .reaction import Loading, react
+from .loading import Loading
+from .reaction import react
 from .sizes import pull_of
 
 

@@ -46,10 +46,10 @@ from ..numerics.quadrature import Grid, locate
 from ..numerics.se3 import base_pose, stacked_rotation
 from .coupling import SOFTENED, ArmProblem, ArmState, Coupling
 from .held import of_forces
+from .loading import Loading
 from .nearest import lying
 from .point_forces import PointForces
 from .pose_terms import finite
-from .reaction import Loading
 from .slip import Rough, Traces, moved_to
 from .touch import Surroundings, Touch
 

@@ -30,8 +30,9 @@ from ..numerics.damped_rules import HARDENING_STAGES, SOFT_STAGES
 from ..numerics.quadrature import Grid
 from .balance import without_force
 from .border import Border, listed
+from .loading import Loading
 from .point_forces import PointForces
-from .reaction import Loading, Reaction
+from .reaction import Reaction
 
 _BOW_TURN = 2.4
 """Angle [rad] by which the plane of bending of `ArmProblem.bowed` turns along the arm."""

@@ -44,8 +44,9 @@ from ..numerics.stacked import (
 from ..typing import Scalar
 from .border import Border
 from .coupling import SOFTENED, ArmProblem, ArmState, Coupling
+from .loading import Loading
 from .pose_terms import PoseTerm, base_of, finite
-from .reaction import Loading, Reaction, rotation_at, rotations
+from .reaction import Reaction, rotation_at, rotations
 from .sizes import shape_of, softest
 
 _SPRING = 1e3

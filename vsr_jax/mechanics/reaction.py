@@ -11,22 +11,18 @@ Positions are computed only if a load depends on them. Wrenches jump only at the
 for contact forces (see `touch`).
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from ..arm.scene import Scene
 from ..numerics.component import Forces, Vector
 from ..numerics.magnus import magnus_6
 from ..numerics.once import once
 from ..numerics.quadrature import (
     Grid,
     before,
-    before_point,
     beyond,
     gauss_legendre,
     interpolation,
@@ -47,87 +43,10 @@ from ..numerics.stacked import (
     transpose,
     turned,
 )
-from .chords import Discs, Pull, discs_of, pull_of
-from .pose_terms import PoseTerm, base_of, finite, pose_terms
-from .touch import Surroundings, Touch, contact_wrenches, touch_of
-
-
-class FollowerPoint(NamedTuple):
-    """A wrench that follows a section: the number of steps before it, 1 at the nodes before it and
-    0 beyond, and the wrench (6,) in the body frame."""
-
-    step: Array
-    before: Array
-    wrench: Array
-
-
-class Loading(NamedTuple):
-    r"""The loads of a scene on a grid, arrays of shape (6, stages, steps); None for those that are
-    absent.
-
-    - `dead`: wrench $(\sum M_i + \int c, n)$ of the world-frame loads beyond each node, known in
-      advance; `dead_density`: $(c, f)$ in the world frame;
-    - `follower_density`: $(c, f)$ in the body frame; `follower_points`: wrenches at points in the
-      body frame;
-    - `by_pose`: loads that depend on the pose of their section;
-    - `discs`: tendons that run straight from disc to disc;
-    - `around`: the obstacles and the contact forces;
-    - `base`: pose of the base, the identity for None.
-    """
-
-    dead: Array | None
-    dead_density: Array | None
-    follower_density: Array | None
-    follower_points: tuple[FollowerPoint, ...]
-    by_pose: tuple[PoseTerm, ...]
-    discs: Discs | None
-    base: Array | None
-    around: Surroundings | None = None
-
-    @property
-    def only_discs(self) -> bool:
-        """Whether there are no loads, only straight tendons."""
-        dead = self.dead is None and self.follower_density is None
-        return dead and not (self.follower_points or self.by_pose or self.around)
-
-    @property
-    def turns_chords(self) -> bool:
-        """Whether loads turn the chords of straight tendons."""
-        return self.discs is not None and not self.only_discs
-
-    @property
-    def motion(self) -> int:
-        """Size of the motions of sections by which wrenches in the world frame change: 0 for dead
-        loads, 3 (rotation) or 6 (and displacement)."""
-        if self.around is not None or any(term.load.needs == "pose" for term in self.by_pose):
-            return 6
-        turns = self.by_pose or self.follower_points
-        return 3 if turns or self.follower_density is not None or self.discs is not None else 0
-
-    def scaled(self, share: Array) -> "Loading":
-        """A fraction of all loads."""
-        return self._mapped(lambda x: share * x)
-
-    def absent(self) -> "Loading":
-        """Zero in place of all loads."""
-        terms = tuple(
-            term._replace(load=finite(term.load), rod=finite(term.rod)) for term in self.by_pose
-        )
-        return self._replace(by_pose=terms)._mapped(jnp.zeros_like)
-
-    def _mapped(self, function: Callable[[Array], Array]) -> "Loading":
-        """A function of every component of the loads."""
-        points = tuple(
-            point._replace(wrench=jax.tree.map(function, point.wrench))
-            for point in self.follower_points
-        )
-        return self._replace(
-            dead=jax.tree.map(function, self.dead),
-            dead_density=jax.tree.map(function, self.dead_density),
-            follower_density=jax.tree.map(function, self.follower_density),
-            follower_points=points,
-            by_pose=tuple(term._replace(share=function(term.share)) for term in self.by_pose),
-        )
+from .chords import Pull, pull_of
+from .loading import Loading
+from .pose_terms import base_of
+from .touch import Touch, contact_wrenches, touch_of
 
 
 class Reaction(NamedTuple):
@@ -193,25 +112,6 @@ class Slopes(NamedTuple):
         every = (self.density, self.ends, self.cells, *(p.matrix for p in self.points))
         matrices = [x for x in every if x is not None]
         return matrices[0].shape[1] if matrices else 0
-
-
-def loading(scene: Scene, grid: Grid) -> Loading | None:
-    """The loads and straight tendons of a scene on a grid; None if it has none."""
-    if not scene.reacts:
-        return None
-    dead_density, follower_density = (scene.density(grid.X, frame) for frame in ("world", "body"))
-    density = None if dead_density is None else stack(dead_density)
-    follower = None if follower_density is None else stack(follower_density)
-    parts = [] if density is None else [beyond(density, grid)]
-    for X, wrench in scene.point_wrenches("world"):
-        parts.append(jnp.where(grid.X < X, stack(wrench)[:, None, None], 0.0))
-    dead = sum(parts[1:], parts[0]) if parts else None
-    points = tuple(
-        FollowerPoint(*before_point(grid, X), stack(wrench))
-        for X, wrench in scene.point_wrenches("body")
-    )
-    by_pose, discs = pose_terms(scene, grid), discs_of(scene, grid)
-    return Loading(dead, density, follower, points, by_pose, discs, scene.rod.base)
 
 
 def partial_rotation(k: Array, h: Array, sigma: Array | float) -> Array:

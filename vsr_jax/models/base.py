@@ -16,7 +16,7 @@ from ..arm.scene import CrossSections, Scene, shared, together
 from ..mechanics.arm_balance import ArmUnknown, problem_of
 from ..mechanics.balance import thread_direction, thread_wrench
 from ..mechanics.coupling import ArmProblem
-from ..mechanics.reaction import Loading, loading
+from ..mechanics.loading import Loading, loading
 from ..mechanics.resolution import COARSE, step_error
 from ..numerics.component import Forces, Vector, dot, times
 from ..numerics.magnus import stacked_twist, step_poses, tip_pose

@@ -20,7 +20,8 @@ from ..mechanics.balance import (
     strain_norm,
     tangent,
 )
-from ..mechanics.reaction import loading, react_at
+from ..mechanics.loading import loading
+from ..mechanics.reaction import react_at
 from ..numerics import component as c
 from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import locate, make_grid

@@ -33,7 +33,8 @@ from ..mechanics.balance import (
     without_force,
 )
 from ..mechanics.coupling import ArmProblem, Coupling
-from ..mechanics.reaction import Loading, react_at
+from ..mechanics.loading import Loading
+from ..mechanics.reaction import react_at
 from ..numerics.component import Forces, Vector
 from ..numerics.magnus import ORDERS
 from ..numerics.quadrature import Grid

@@ -35,10 +35,9 @@ from ..mechanics.balance import (
 )
 from ..mechanics.cable import chords_of
 from ..mechanics.chords import Pull
+from ..mechanics.loading import Loading, loading
 from ..mechanics.reaction import (
-    Loading,
     Reaction,
-    loading,
     partial_rotation,
     react,
     rotations,
