@@ -21,8 +21,7 @@ os.environ.setdefault(
     + "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1 "
     # without these passes XLA takes a quarter less of what remains
     + "--xla_disable_hlo_passes=simplify-while-loops,while-loop-invariant-code-motion,"
-    + "while-loop-constant-sinking,reshape-mover,simplify-conditional,simplify-sorts,"
-    + "tree_reduction_rewriter",
+    + "while-loop-constant-sinking,reshape-mover,simplify-conditional",
 )
 
 os.environ.setdefault("VSR_JAX_CACHE", "off")  # commands run here leave nothing behind
