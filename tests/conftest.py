@@ -2,10 +2,9 @@
 and the paper's helix.
 
 Nearly all of the suite's time is XLA's compiler, and each program runs only a few times on little
-data: so it runs without its optimisations, without passes that look for what these programs do not
-have or for what is cheap at this size, and without threads of its own beside the two test
-processes, which is three to four times faster. Set XLA_FLAGS yourself (to nothing, say) to test
-what users run.
+data: so it runs without its optimisations, without some passes over loops and branches, and without
+threads of its own beside the two test processes, which is two to three times faster or more. Set
+XLA_FLAGS yourself (to nothing, say) to test what users run.
 """
 
 import gc

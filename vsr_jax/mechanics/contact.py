@@ -137,7 +137,7 @@ class Contacts(Coupling):
         )
 
     def start(self, xi: Vector, problem: ArmProblem) -> Vector:
-        """The bending of the middle of what encloses the arm, if it is bent."""
+        """The bending of the middle of what encloses the arm, if anything does."""
         for obstacle in self.obstacles:
             bending = _bending_along(obstacle, self.rod.base, problem.grid.h)
             if bending is not None:
