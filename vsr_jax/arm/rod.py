@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..numerics.component import Vector, norm
+from ..numerics.se3 import nearest_pose
 from ..typing import ArrayLike, MatrixLike, Pose, Scalar
 from ..validation import instance, instances, numbers, rigid as rigid_transform
 from .description import Part
@@ -88,6 +89,13 @@ class Rod(Part):
             else numbers("Rod.guide_radius", guide_radius, positive=True)
         )
         self.rigid = instances("Rod.rigid", rigid, RigidPiece, "a RigidPiece")
+
+    @property
+    def frame(self) -> Pose | None:
+        """Pose of the section at X = 0: the base with its rotation orthonormal to rounding. With
+        one of six digits the residual would have no energy, and arms that lie along a wall would
+        take many more steps, or not be solved."""
+        return None if self.base is None else nearest_pose(self.base)
 
     def rest(self, X: Scalar) -> Vector:
         """Rest strain $\\xi^*$ at X [m], six scalars."""

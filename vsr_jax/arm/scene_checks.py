@@ -174,7 +174,7 @@ def _at_rest(rod: Rod, edges: Array) -> tuple[Array, Array, Array]:
     """Abscissas [m] along the arm, its positions there at rest, and the radii of its outline."""
     grid = make_grid(edges, _STEPS, 3)
     strain = jax.vmap(jax.vmap(rod.rest))(grid.X)
-    poses = step_poses(tuple(strain), grid.h, rod.base)
+    poses = step_poses(tuple(strain), grid.h, rod.frame)
     X = jnp.append(grid.start, rod.length)
     return X, poses[:, :3, 3], jax.vmap(rod.outline)(X)
 

@@ -192,7 +192,7 @@ def thread_length(
 def chords_of(scene: Scene, xi: Vector, grid: Grid) -> Pull:
     """The chords of the straight tendons of a scene without their forces."""
     zero = (jnp.zeros_like(scene.rod.length),) * len(scene.actuators)
-    only = Loading(None, None, None, (), (), discs_of(scene, grid), scene.rod.base)
+    only = Loading(None, None, None, (), (), discs_of(scene, grid), scene.rod.frame)
     pull = react(xi, grid, only, zero).pull
     assert pull is not None  # see `Scene.straight`
     return pull

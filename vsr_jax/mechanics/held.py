@@ -300,10 +300,10 @@ def holds_of(scene: Scene, sections: CrossSections, grid: Grid) -> Holds | None:
     """The held sections of a scene; None if it has none."""
     if not scene.held:
         return None
-    base = jnp.asarray(base_pose(scene.rod.base, grid.h.dtype))
+    base = jnp.asarray(base_pose(scene.rod.frame, grid.h.dtype))
     axes = base[:3, :3]
     rest = stack(tuple(jnp.broadcast_to(x, grid.X.shape) for x in sections.rest))
-    starts, R, end = rotations(rows_of(rest, 0, 3), grid.h, scene.rod.base)
+    starts, R, end = rotations(rows_of(rest, 0, 3), grid.h, scene.rod.frame)
     axis = matvec(R, rows_of(rest, 3, 6))
 
     def hold(held: Held) -> Hold:

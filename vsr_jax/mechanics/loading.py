@@ -109,4 +109,4 @@ def loading(scene: Scene, grid: Grid) -> Loading | None:
         for X, wrench in scene.point_wrenches("body")
     )
     by_pose, discs = pose_terms(scene, grid), discs_of(scene, grid)
-    return Loading(dead, density, follower, points, by_pose, discs, scene.rod.base)
+    return Loading(dead, density, follower, points, by_pose, discs, scene.rod.frame)

@@ -238,7 +238,7 @@ class SteppedModel(Model):
         return make_grid(scene.edges(self.breakpoints(scene)), self.steps, self.order // 2)
 
     def tip(self, scene: Scene, forces: Forces, state: Any) -> Pose:
-        return tip_pose(self.node_strain(scene, state), self.grid(scene).h, scene.rod.base)
+        return tip_pose(self.node_strain(scene, state), self.grid(scene).h, scene.rod.frame)
 
     def finer(self) -> "SteppedModel":
         return replace(self, steps=2 * self.steps)
@@ -272,13 +272,13 @@ class SteppedModel(Model):
                 return self._coarser(scene, inputs, forces, state)
         grid = make_grid(scene.edges(self.breakpoints(scene)), 2 * self.steps, 3)
         given, other = self._corrected(scene, inputs, forces, state, grid)
-        return Refinement(tip_pose(other, grid.h, scene.rod.base), grid.X, given, other)
+        return Refinement(tip_pose(other, grid.h, scene.rod.frame), grid.X, given, other)
 
     def _merged(self, scene: Scene, state: Any) -> Refinement:
         """By pairs of steps."""
         grid, xi = self.grid(scene), self.node_strain(scene, state)
         error = (self.steps / (self.steps // 2 * 2)) / (2**self.order - 1)
-        return Refinement(merged_tip(xi, grid, scene.rod.base), grid.X, xi, xi, _UNSETTLED * error)
+        return Refinement(merged_tip(xi, grid, scene.rod.frame), grid.X, xi, xi, _UNSETTLED * error)
 
     def _coarser(self, scene: Scene, inputs: Array, forces: Forces, state: Any) -> Refinement:
         """By half as many steps, with the orders that the errors of the tip and, as a polynomial
@@ -291,7 +291,7 @@ class SteppedModel(Model):
             for order in (self.order, self.order // 2 + 1)
         )
         return Refinement(
-            tip_pose(other, grid.h, scene.rod.base), grid.X, given, other, tip, strain
+            tip_pose(other, grid.h, scene.rod.frame), grid.X, given, other, tip, strain
         )
 
     def _corrected(
@@ -309,7 +309,7 @@ class SteppedModel(Model):
         self, scene: Scene, forces: Forces, state: Any, X: Float[Array, " stations"]
     ) -> Float[Array, "stations 4 4"]:
         grid = self.grid(scene)
-        ends = step_poses(self.node_strain(scene, state), grid.h, scene.rod.base)
+        ends = step_poses(self.node_strain(scene, state), grid.h, scene.rod.frame)
         step, _ = locate(grid, X)
         h = X - grid.start[step]
         nodes = gauss_legendre(self.order // 2)[0].astype(h.dtype)

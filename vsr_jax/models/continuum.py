@@ -164,7 +164,7 @@ class Continuum(Model):
 
 
 def _from_base(scene: Scene, g: Array) -> Array:
-    return g if scene.rod.base is None else scene.rod.base @ g
+    return g if scene.rod.frame is None else scene.rod.frame @ g
 
 
 def _initial_value(scene: Scene) -> bool:
@@ -226,7 +226,7 @@ def _line_jvp(primals: tuple, tangents: tuple) -> tuple[Line, Line]:
         found = steps.solve(scene, inputs)
         xi = c.join(steps.strain(scene, found.forces, found.state, X))
         poses = steps.poses(scene, found.forces, found.state, X)
-        base = scene.rod.base
+        base = scene.rod.frame
         return Line(xi, poses if base is None else inverse(base) @ poses)
 
     _, change = eqx.filter_jvp(derivative, primals, tangents)
@@ -237,7 +237,7 @@ def _relative(scene: Scene, g: Array) -> Array:
     """Poses relative to the base, from poses with the base's origin but the world's axes."""
     if scene.rod.base is None:
         return g
-    turn = jnp.eye(4, dtype=g.dtype).at[:3, :3].set(scene.rod.base[:3, :3].T)
+    turn = jnp.eye(4, dtype=g.dtype).at[:3, :3].set(scene.rod.frame[:3, :3].T)
     return turn @ g
 
 

@@ -283,7 +283,7 @@ def wrench_scale(scene: Scene, reaction: Array) -> Array:
 def _misfit(scene: Scene, unknown: ShootingUnknown, ends: Array, segments: Grid) -> Array:
     """Mismatch of the segments: rotation (3) at the start against the end of the segment before,
     reaction (6) at the end against the start of the next, and position (3) as the rotation."""
-    base = base_pose(scene.rod.base, ends.dtype)
+    base = base_pose(scene.rod.frame, ends.dtype)
     wrench, rotation, position = ends[:, :6], ends[:, 6:15].reshape(-1, 3, 3), ends[:, 15:]
     before = jnp.concatenate([base[None, :3, :3], rotation[:-1]])
     m = jnp.einsum("sji,sjk->sik", before, unknown.rotation)

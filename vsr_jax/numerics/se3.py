@@ -161,6 +161,15 @@ def whole_pose(g: Array) -> Float[Array, "*batch 4 4"]:
     return jnp.concatenate([upper, last], axis=-2)
 
 
+def nearest_pose(g: Pose) -> Pose:
+    r"""The pose with the rotation nearest to a matrix R that is nearly one, as with six digits, by
+    two steps $R \gets \tfrac12 R (3 - R^T R)$ (Higham, Functions of Matrices, 2008, chapter 8)."""
+    R = g[:3, :3]
+    for _ in range(2):
+        R = 1.5 * R - 0.5 * product(R, product(R.swapaxes(0, 1), R))
+    return g.at[:3, :3].set(R)
+
+
 def base_pose(base: Array | None, dtype: Any) -> Array | np.ndarray:
     """Pose of the base, shape (4, 4) or (4, 4, arms); the identity for None."""
     return np.eye(4, dtype=dtype) if base is None else base

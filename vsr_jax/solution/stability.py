@@ -238,7 +238,7 @@ def arm_of(scene: Scene, forces: Vector, nodes: Nodes) -> Arm:
 def _unit_wrench(scene: Scene, xi: Vector, nodes: Nodes, place: int) -> Vector:
     """Derivative of a thread's length by the strain at each node."""
     if scene.actuators[place].straight:
-        rotation = rotations(stacked.stack(xi[:3]), nodes.grid.h, scene.rod.base)[1]
+        rotation = rotations(stacked.stack(xi[:3]), nodes.grid.h, scene.rod.frame)[1]
         return chords_of(scene, xi, nodes.grid).unit(place, rotation)
     path = nodes.sections.paths[place]
     wrench = thread_wrench(thread_direction(xi, path)[0], path)
