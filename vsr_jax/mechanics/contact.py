@@ -289,8 +289,9 @@ class Contacts(Coupling):
         root = jnp.sqrt(apart**2 + 4 * square)
         total, excess = force + pushed, force * pushed - square
         inside = (force > 0) & (pushed > 0) & (excess > 0)
-        total = jnp.where(inside, total, 1.0)
-        smooth = jnp.where(inside, excess / total, 0.5 * (force + pushed - root))
+        # the difference of sum and root loses the digits of a force where a gap is large
+        whole = jnp.where(inside, total, 0.5 * (jnp.abs(total) + root))
+        smooth = jnp.where(total > 0, excess / whole, 0.5 * (total - root))
         return smooth, 0.5 * (1 + apart / jnp.where(inside, total, root))
 
     def sizes(self, x: PyTree, at: ArmState, problem: ArmProblem) -> list[Array]:

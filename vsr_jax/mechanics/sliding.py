@@ -27,7 +27,7 @@ from jaxtyping import Array
 
 from ..numerics.component import Vector
 from ..numerics.once import once
-from ..numerics.quadrature import Grid, value_weights
+from ..numerics.quadrature import Grid, gauss_legendre, value_weights
 from ..numerics.stacked import components, matvec, stack, total, transpose
 from .reaction import Reaction
 from .touch import Touch, motions_at
@@ -37,7 +37,7 @@ class Sliding(NamedTuple):
     r"""Sliding by shear.
 
     **Fields:** the `touch`, whose `slide` includes shear; `values` $\ell$ (stages, obstacles,
-    steps, *arms); `shares` $h / w$ of a step, and the `compliance` c, of the shear strains that are
+    steps, *arms); `shares` $h / w$ of the nodes of a step, and the `compliance` c, of the shear strains that are
     `free`, (stages, steps, *arms); the `rotation` of the nodes and the lengths `h`.
     """
 
@@ -86,7 +86,9 @@ def sliding_of(
         compliance = jnp.maximum(compliance, 1 / stiffness[i])
     if flexible is not None:
         compliance = compliance * flexible
-    values, shares = value_weights(touch.sigma, grid.X.shape[0]), grid.h / grid.weight
+    stages = grid.X.shape[0]
+    values, weights = value_weights(touch.sigma, stages), gauss_legendre(stages)[1]
+    shares = jnp.asarray(1 / weights, grid.h.dtype).reshape(-1, *(1,) * grid.h.ndim)
     gain = total(values**2 * (shares * compliance)[:, None], 0)
     touch = touch._replace(slide=touch.slide / (1 - grid.h * touch.slide * gain))
     return Sliding(touch, values, shares, compliance, sheared, along.rotation, grid.h)
