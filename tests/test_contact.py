@@ -147,6 +147,33 @@ def test_a_solve_may_start_from_an_arm_among_other_obstacles(round_first):
     np.testing.assert_allclose(warm.tip, cold.tip, atol=1e-8)
 
 
+@pytest.mark.parametrize("where", ["one load at the tip's abscissa", "two loads at one place"])
+def test_steps_of_no_length_touch_nothing(pressed, where):
+    """Both leave a step without length in the grid, and other steps a little longer."""
+    loads, same = [vsr.PointWrench(L, PRESS.force)], pressed
+    if where == "two loads at one place":
+        loads = [vsr.PointWrench(0.15, force) for force in ((0, 0.005, -0.01), (0, 0, -0.02))]
+        same = solved(vsr.PointWrench(0.15, PRESS.force), obstacles=SPHERE)
+    eq = solved(*loads, obstacles=SPHERE)
+    assert eq.steps < 30
+    np.testing.assert_allclose(eq.tip[:3, 3], same.tip[:3, 3], rtol=0, atol=1e-4 * L)
+    np.testing.assert_allclose(jnp.sum(eq.contacts.force), jnp.sum(same.contacts.force), rtol=2e-3)
+
+
+def test_a_base_of_six_digits_is_a_base():
+    """An arm that lies along a floor: with such a base as it is, hundreds of Newton steps."""
+    turn = vsr.se3.exp(jnp.array([0.3, -1.1, 0.7, 0.0, 0.0, 0.0]))
+    R = turn[:3, :3]
+    floor = vsr.Plane(R[:, 2], -0.03 * R[:, 2])
+    weight, push = vsr.Gravity(-9.81 * R[:, 2]), vsr.TipWrench(force=R @ jnp.array(PRESS.force))
+    exact, rounded = (
+        solved(weight, push, arm=rod(base=base), obstacles=floor)
+        for base in (turn, jnp.round(turn, 6))
+    )
+    assert rounded.steps <= exact.steps + 3
+    np.testing.assert_allclose(rounded.tip[:3, 3], exact.tip[:3, 3], rtol=0, atol=2e-6 * L)
+
+
 def test_the_force_jumps_at_the_contact(pressed):
     contacts = pressed.contacts
     at = int(jnp.argmax(contacts.force[0]))

@@ -114,6 +114,24 @@ def test_the_derivative_of_the_energy_by_a_tension_is_the_sum_of_chords(weighed)
     np.testing.assert_allclose(slope, weighed.lengths, rtol=1e-9)
 
 
+def test_a_moment_at_the_tip_leaves_an_arm_with_discs_stable():
+    """The pivots of its tangent without the turning of the chords miss pairs of its negative
+    eigenvalues, since a moment has no potential."""
+    moment = vsr.TipWrench(force=(0.0, 0.3 * EI / LENGTH**2, 0.0), moment=(0.4 * EI / LENGTH, 0, 0))
+    arm = vsr.Scene(ARM, [vsr.Tendon(vsr.Parallel(0.0, -0.007), discs=4)], [moment])
+    tensions = jnp.array([[1.0], [2.0]]) * 0.25 * EI / (LENGTH * 0.007)
+
+    @jax.jit
+    @jax.vmap
+    def solved(tension):
+        eq = vsr.solve(arm, tension, model=STEPS)
+        return eq.status, eq.stability
+
+    status, margin = solved(tensions)
+    assert jnp.all(status == vsr.Status.CONVERGED)
+    assert jnp.all(margin > 0.5)
+
+
 def test_lengths_give_back_the_tensions(weighed):
     driven = scene([vsr.Gravity()], discs=3, control="length")
     changes = weighed.lengths - jnp.array([driven.rest_length(i) for i in range(2)])

@@ -42,8 +42,8 @@ class Rod(Part):
     - `rest_strain`: $\\xi^*(X) = (k^*, u^*)$: six profiles (numbers, `Profile` or functions of X),
       or one function of X that returns six numbers. The default (0, 0, 0, 1, 0, 0) is straight. The
       elongation $u_x^*$ must be positive.
-    - `base`: pose of the section at X = 0, a rigid transform of shape (4, 4); the identity by
-      default.
+    - `base`: pose of the section at X = 0, a rigid transform of shape (4, 4), of which six digits
+      are enough; the identity by default.
     - `guide_radius`: radius [m] of discs that guide the threads outside the section; by default
       the threads are inside the section.
     - `rigid`: the `RigidPiece`s of the arm, parts of it that do not bend.

@@ -37,8 +37,9 @@ class Sliding(NamedTuple):
     r"""Sliding by shear.
 
     **Fields:** the `touch`, whose `slide` includes shear; `values` $\ell$ (stages, obstacles,
-    steps, *arms); `shares` $h / w$ of the nodes of a step, and the `compliance` c, of the shear strains that are
-    `free`, (stages, steps, *arms); the `rotation` of the nodes and the lengths `h`.
+    steps, *arms); `shares` $h / w$ of the nodes of a step (stages, 1, ...), and the `compliance` c,
+    of the shear strains that are `free`, (stages, steps, *arms); the `rotation` of the nodes and
+    the lengths `h`.
     """
 
     touch: Touch

@@ -164,7 +164,8 @@ class Continuum(Model):
 
 
 def _from_base(scene: Scene, g: Array) -> Array:
-    return g if scene.rod.frame is None else scene.rod.frame @ g
+    frame = scene.rod.frame
+    return g if frame is None else frame @ g
 
 
 def _initial_value(scene: Scene) -> bool:
@@ -235,9 +236,10 @@ def _line_jvp(primals: tuple, tangents: tuple) -> tuple[Line, Line]:
 
 def _relative(scene: Scene, g: Array) -> Array:
     """Poses relative to the base, from poses with the base's origin but the world's axes."""
-    if scene.rod.base is None:
+    frame = scene.rod.frame
+    if frame is None:
         return g
-    turn = jnp.eye(4, dtype=g.dtype).at[:3, :3].set(scene.rod.frame[:3, :3].T)
+    turn = jnp.eye(4, dtype=g.dtype).at[:3, :3].set(frame[:3, :3].T)
     return turn @ g
 
 
