@@ -6,20 +6,16 @@ differences of the solve, on random scenes.
 A structure is a subset of the effects below and where they act. Twelve structures are chosen so
 that for any two effects all four combinations of on and off occur. Seventeen scenes are drawn for
 each structure, with random sizes, moduli, base, rest strain, routings, loads, friction and inputs.
-A function f of the tip's pose, the thread forces and the slack is differentiated with respect to
-all numbers of scene and inputs, along a random direction v: in forward mode, in reverse mode (the
-gradient times v), and by fourth-order central differences of the solve. The three must agree to
-1e-7 of the derivative. NaN is counted separately; so are scenes without an equilibrium, whose
-derivatives must be zero or NaN in both modes. The error of a difference is estimated from those of
-other step sizes. Only points where the solve is smooth are used: points where other cables are
-slack than at the centre, or where the steps are distributed differently over the pieces of the arm,
-are left out. A scene with too few points left is counted as at a switch.
+A function of the tip's pose, the thread forces and the slack is differentiated as in
+`gradient_check.py`. Points where other cables are slack than at the centre, or where the steps are
+distributed differently over the pieces of the arm, are left out.
 """
 
 import argparse
 import json
 import time
 from collections.abc import Iterable
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,18 +23,17 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 
 import vsr_jax as vsr
 from vsr_jax.cli.common import reduce_compile_time
 
+try:
+    from benchmarks import gradient_check as check
+except ModuleNotFoundError:  # as a script
+    import gradient_check as check
+
 SEED = 12
 STEPS = 8
-SAME = 1e-7
-"""Largest difference between two derivatives that count as the same, as a share of the
-derivative."""
-WIDEST, HALVINGS = 0.02, 10
-"""Largest step of the differences as a share of each number, and the number of halvings."""
 
 EFFECTS = (
     "gravity",
@@ -121,7 +116,7 @@ def structures(number: int) -> list[Structure]:
     return [structure(effects) for effects in found[:number]]
 
 
-class _Arm(NamedTuple):
+class Arm(NamedTuple):
     """Length [m], radius of the tip [m] and bending stiffness EI [N m^2] of an arm."""
 
     length: float
@@ -129,15 +124,7 @@ class _Arm(NamedTuple):
     bending: float
 
 
-class Drawn(NamedTuple):
-    """A scene, its inputs, and the size of its forces [N]."""
-
-    scene: vsr.Scene
-    inputs: jax.Array
-    force: float
-
-
-def drawn(made: Structure, random: np.random.Generator) -> Drawn:
+def drawn(made: Structure, random: np.random.Generator) -> check.Drawn:
     """A random scene and its inputs, without zeros."""
     on, uniform = set(made.effects), random.uniform
     L = uniform(0.2, 0.4)
@@ -154,34 +141,34 @@ def drawn(made: Structure, random: np.random.Generator) -> Drawn:
     material = vsr.Material(stiff, poisson=uniform(0.3, 0.49), density=density)
     pose = vsr.se3.exp(jnp.asarray([*uniform(-1, 1, 3), *uniform(-0.1, 0.1, 3)]))
     rod = vsr.Rod(L, section, material, rest_strain=rest, base=pose)
-    arm = _Arm(L, 0.7 * base, EI)
-    threads: list[tuple[Any, float]] = [_tendon(made, i, arm, random) for i in range(2)]
+    arm = Arm(L, 0.7 * base, EI)
+    threads: list[tuple[Any, float]] = [tendon(made, i, arm, random) for i in range(2)]
     if "chamber" in on:
         y, z = uniform(0.2, 0.5, 2) * arm.radius * random.choice([-1, 1], 2)
         area = np.pi * (uniform(0.1, 0.3) * arm.radius) ** 2
         threads.append(
             (
                 vsr.Chamber(vsr.Linear(y, z, *(uniform(-0.3, 0.3, 2) * arm.radius / L)), area),
-                _pull(arm, random) / area,
+                pull(arm, random) / area,
             )
         )
     actuators, inputs = zip(*threads, strict=True)
     free: dict[str, Any] = {} if made.free is None else {"free_strains": made.free}
-    scene = vsr.Scene(rod, actuators, _loads(on, arm, density, random), **free)
-    return Drawn(scene, jnp.asarray(inputs), EI / (L * arm.radius))
+    scene = vsr.Scene(rod, actuators, loads(on, arm, density, random), **free)
+    return check.Drawn(scene, jnp.asarray(inputs), EI / (L * arm.radius))
 
 
-def _pull(arm: _Arm, random: np.random.Generator) -> float:
+def pull(arm: Arm, random: np.random.Generator) -> float:
     """Force [N] of a thread that bends the arm by about 0.2 to 1.5 radians."""
     return random.uniform(0.2, 1.5) * arm.bending / (arm.length * 0.6 * arm.radius)
 
 
-def _tendon(
-    made: Structure, place: int, arm: _Arm, random: np.random.Generator
+def tendon(
+    made: Structure, place: int, arm: Arm, random: np.random.Generator
 ) -> tuple[vsr.Tendon, float]:
     """A straight tendon or a helical one, and its input."""
     uniform = random.uniform
-    radius, phase, force = uniform(0.4, 0.9) * arm.radius, uniform(0, 2 * np.pi), _pull(arm, random)
+    radius, phase, force = uniform(0.4, 0.9) * arm.radius, uniform(0, 2 * np.pi), pull(arm, random)
     path = vsr.Helix(radius, pitch=arm.length / uniform(0.3, 1.2), phase=phase)
     options: dict[str, Any] = {}
     if place == 0:
@@ -204,7 +191,7 @@ def _tendon(
     return vsr.Tendon(path, control="length", **options), 2 * shortened if loose else -shortened
 
 
-def _loads(on: set[str], arm: _Arm, density: float, random: np.random.Generator) -> list:
+def loads(on: set[str], arm: Arm, density: float, random: np.random.Generator) -> list:
     """The loads of the effects that are on."""
     uniform, loads = random.uniform, []
     unit = arm.bending / arm.length**2
@@ -239,147 +226,16 @@ def _loads(on: set[str], arm: _Arm, density: float, random: np.random.Generator)
     return loads
 
 
-class Program:
-    """Compiled functions for the scenes of a structure: f, and its derivatives."""
-
-    def __init__(self, like: Drawn, model: Any, random: np.random.Generator):
-        _, rebuild = ravel_pytree(like[:2])
-        mix = jnp.asarray(random.normal(size=12 + 2 * like.inputs.size))
-
-        def value(x: jax.Array, force: jax.Array) -> tuple[jax.Array, tuple]:
-            scene, inputs = rebuild(x)
-            eq = vsr.solve(scene, inputs, model=model)
-            grid = vsr.StrainDependent(STEPS).grid(scene)
-            pieces = jnp.searchsorted(scene.edges(), grid.start + 0.5 * grid.h)
-            parts = jnp.concatenate(
-                [eq.tip[:3, 3] / 0.3, eq.tip[:3, :3].ravel(), eq.forces / force, eq.slack / 0.01]
-            )
-            return mix @ parts, (eq.status, eq.forces == 0, pieces)
-
-        def derivatives(x: jax.Array, force: jax.Array, v: jax.Array) -> tuple[jax.Array, ...]:
-            _, push = jax.linearize(lambda x: value(x, force)[0], x)
-            (gradient,) = jax.linear_transpose(push, x)(jnp.ones(()))
-            return push(v), gradient @ v
-
-        self.value, self.derivatives = jax.jit(jax.vmap(value)), jax.jit(jax.vmap(derivatives))
-
-
-class Found(NamedTuple):
-    """Results of one scene: its status, the three derivatives, and the estimated error of the
-    difference (NaN at a switch)."""
-
-    status: int
-    forward: float
-    reverse: float
-    difference: float
-    error: float
-
-
-def search(made: Structure, draws: int, model: Any = None) -> list[Found]:
+def search(made: Structure, draws: int, model: Any = None) -> list[check.Found]:
     """Derivatives of reproducible random scenes of a structure."""
     random = stream(made.effects)
     scenes = [drawn(made, random) for _ in range(draws)]
-    program = Program(scenes[0], vsr.StrainDependent(STEPS) if model is None else model, random)
-    x, force = (
-        jnp.stack([ravel_pytree(one[:2])[0] for one in scenes]),
-        jnp.asarray([one.force for one in scenes]),
+    model = vsr.StrainDependent(STEPS) if model is None else model
+    return check.compared(
+        scenes,
+        check.Program(scenes[0], model, random, partial(check.observed, steps=STEPS)),
+        random,
     )
-    v = random.normal(size=x.shape) * np.where(x == 0, 1e-3, np.abs(x))
-    forward, reverse = (np.asarray(part) for part in program.derivatives(x, force, v))
-    steps = WIDEST * 0.5 ** np.arange(HALVINGS + 1)
-    places = np.concatenate([[0.0], steps, -steps])
-    points = (x[:, None] + places[:, None] * v[:, None]).reshape(-1, x.shape[1])
-    values, (status, *switches) = program.value(points, jnp.repeat(force, len(places)))
-    values, status = np.asarray(values).reshape(draws, -1), np.asarray(status).reshape(draws, -1)
-    for switch in switches:
-        told = np.asarray(switch).reshape(*values.shape, -1)
-        values = np.where(np.all(told == told[:, :1], axis=2), values, np.nan)
-    odd = values[:, 1 : len(steps) + 1] - values[:, len(steps) + 1 :]
-    found = [difference(*pair) for pair in zip(odd, np.broadcast_to(steps, odd.shape), strict=True)]
-    return [
-        Found(int(s[0]), float(f), float(r), *d)
-        for s, f, r, d in zip(status, forward, reverse, found, strict=True)
-    ]
-
-
-def difference(odd: np.ndarray, steps: np.ndarray) -> tuple[float, float]:
-    r"""Fourth-order central difference $(8 (f_h - f_{-h}) - (f_{2h} - f_{-2h})) / 12 h$ and its
-    error, from $f_h - f_{-h}$ at successively halved steps.
-
-    The chosen step is the one whose difference is closest to those of twice and of half the step;
-    the error is four times that distance.
-    """
-    slopes = (8 * odd[1:] - odd[:-1]) / (12 * steps[1:])
-    changes = np.abs(np.diff(slopes))
-    errors = np.maximum(changes[1:], changes[:-1])
-    if np.all(np.isnan(errors)):
-        return float("nan"), float("nan")
-    best = int(np.nanargmin(errors))
-    return float(slopes[best + 1]), 4 * float(errors[best])
-
-
-def verdict(found: Found) -> str:
-    """Verdict on a draw; it starts with `wrong` if a derivative is wrong."""
-    nan = np.isnan(found.forward), np.isnan(found.reverse)
-    if found.status != vsr.Status.CONVERGED:
-        none = all(nan) or found.forward == found.reverse == 0
-        return "not converged" if none else "wrong: not converged, with a derivative"
-    if any(nan):
-        return "NaN in both" if all(nan) else "NaN in one mode"
-    if abs(found.forward - found.reverse) > SAME * abs(found.forward):
-        return "wrong: the modes differ"
-    if np.isnan(found.error):
-        return "at a switch"
-    if abs(found.forward - found.difference) > SAME * abs(found.forward) + found.error:
-        return "wrong: not the difference"
-    return "agrees" if found.error <= SAME * abs(found.forward) else "difference too rough"
-
-
-def summary(found: list[Found]) -> dict[str, Any]:
-    """The row of a structure: counts, and the largest relative differences."""
-    said = [verdict(one) for one in found]
-    counts = {words: said.count(words) for words in sorted(set(said))}
-    solved = [
-        one
-        for one in found
-        if one.status == vsr.Status.CONVERGED and not np.isnan(one.forward + one.reverse)
-    ]
-    modes = [abs(one.forward - one.reverse) / abs(one.forward) for one in solved]
-    apart = [
-        abs(one.forward - one.difference) / abs(one.forward)
-        for one in solved
-        if one.error <= SAME * abs(one.forward)
-    ]
-    return {
-        "draws": len(found),
-        "converged": sum(one.status == vsr.Status.CONVERGED for one in found),
-        "verdicts": counts,
-        "forward - reverse": max(modes, default=None),
-        "forward - differences": max(apart, default=None),
-    }
-
-
-def line(name: str, row: dict[str, Any]) -> str:
-    """A line of the table."""
-    said = row["verdicts"]
-    worst = (
-        "-" if row[key] is None else f"{row[key]:.0e}"
-        for key in ("forward - reverse", "forward - differences")
-    )
-    wrong = sum(number for words, number in said.items() if words.startswith("wrong"))
-    counts = (
-        said.get(words, 0)
-        for words in ("NaN in both", "NaN in one mode", "at a switch", "difference too rough")
-    )
-    cells = (name, row["draws"], row["converged"], *counts, wrong, *worst)
-    return f"| {' | '.join(str(cell) for cell in cells)} |"
-
-
-HEADER = (
-    "| effects | draws | converged | NaN in both | NaN in one mode | at a switch | difference too "
-    "rough | wrong "
-    "| forward - reverse | forward - differences |\n|" + "---|" * 10
-)
 
 
 def main() -> None:
@@ -400,7 +256,7 @@ def main() -> None:
     options = parser.parse_args()
     reduce_compile_time(optimise=False)  # nothing is timed
     jax.config.update("jax_enable_x64", True)
-    print(HEADER)
+    print(check.HEADER)
     rows = []
     chosen = structures(options.structures)
     for made, basis in [
@@ -416,14 +272,14 @@ def main() -> None:
         row = {
             "model": "Prescribed" if basis else "StrainDependent",
             **made._asdict(),
-            **summary(found),
+            **check.summary(found),
         }
         print(
-            line(name + " (Prescribed)" * basis, row),
+            check.line(name + " (Prescribed)" * basis, row),
             f"{time.perf_counter() - began:.0f} s",
             flush=True,
         )
-        rows.append({**row, "found": [[verdict(one), *one] for one in found]})
+        rows.append({**row, "found": [[check.verdict(one), *one] for one in found]})
     if options.json:
         record = {"seed": SEED, "steps": STEPS, "jax": jax.__version__, "structures": rows}
         Path(options.json).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")

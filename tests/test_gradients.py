@@ -229,7 +229,7 @@ def test_a_design_of_a_modulus_under_friction_runs():
 def test_what_the_search_takes_for_wrong():
     """Of the sine at 1, computed with noise: a difference too rough to tell is no agreement, and a
     derivative off by 1e-6 is wrong."""
-    from benchmarks.gradient_search import Found, difference, verdict
+    from benchmarks.gradient_check import Found, difference, verdict
 
     steps, exact, random = 0.02 * 0.5 ** np.arange(11), np.cos(1.0), np.random.default_rng(0)
     odd = np.sin(1 + steps) - np.sin(1 - steps)
@@ -253,7 +253,8 @@ def test_what_the_search_takes_for_wrong():
 
 @pytest.mark.slow
 def test_a_dozen_drawn_scenes_have_the_right_gradient_or_none():
-    from benchmarks.gradient_search import search, structures, verdict
+    from benchmarks.gradient_check import verdict
+    from benchmarks.gradient_search import search, structures
 
     chosen = [
         made
