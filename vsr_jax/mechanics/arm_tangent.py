@@ -165,14 +165,14 @@ def _bordered(
     if border is None:
         found, definiteness = solve(*sides)
         return tuple(x[0] for x in found), coupled, definiteness
-    found, answers, (negative, doubtful) = solve_both(solve, sides, border.columns, apart=apart)
+    found, answers, definiteness = solve_both(solve, sides, border.columns, apart=apart)
     right = jnp.concatenate([rows[place] for place in places])
     strain, x, held = bordered_solve(tuple(x[0] for x in found), answers, right, border, grid)
     first = 0
     for place in places:
         size = len(rows[place])
         coupled[place], first = x[first : first + size], first + size
-    return strain, coupled, Definiteness(negative - held, doubtful)
+    return strain, coupled, definiteness.without(held)
 
 
 def tangent_solve(

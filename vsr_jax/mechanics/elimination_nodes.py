@@ -35,6 +35,13 @@ class Definiteness(NamedTuple):
     negative: Array
     doubtful: Array
 
+    def without(self, prevented: Array) -> "Definiteness":
+        """That of a tangent in which so many of the motions with negative eigenvalues are
+        prevented. If there are fewer of them, the pivots have missed pairs."""
+        negative = self.negative - prevented
+        missed = negative < 0
+        return Definiteness(jnp.where(missed, negative % 2, negative), self.doubtful | missed)
+
 
 def definiteness(negative: Array, local: Array, asymmetry: Array, grid: Grid) -> Definiteness:
     """From the number of negative eigenvalues of the pivots of each cell, whether its section is

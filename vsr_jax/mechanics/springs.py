@@ -53,18 +53,9 @@ def with_springs(solve: Solve, springs: Vector, grid: Grid, *, apart: bool) -> S
         force = jax.vmap(partial(lu.substitute, factors), 1, 1)(work(stack(x)))
         less = jnp.einsum("jk...,cjsn...->cksn...", force, answers)
         held = jnp.sum(lu.diagonal(factors) < 0, axis=0, dtype=jnp.int32)
-        negative, doubtful = definiteness
-        return c.subtract(x, components(less)), _with_pairs(negative - held, doubtful)
+        return c.subtract(x, components(less)), definiteness.without(held)
 
     return stiffer
-
-
-def _with_pairs(negative: Array, doubtful: Array) -> Definiteness:
-    """The number of negative eigenvalues from one that may be below zero: then the pivots of a
-    tangent that is not symmetric have missed pairs of them, and whether all are found again is
-    doubtful."""
-    missed = negative < 0
-    return Definiteness(jnp.where(missed, negative % 2, negative), doubtful | missed)
 
 
 def solve_both(
