@@ -96,7 +96,7 @@ def drawn(effects: frozenset[str], random: np.random.Generator) -> check.Drawn |
     plain = tendons.structure(effects & frozenset(PLAIN))
     scene, inputs, force = tendons.drawn(plain, random)
     length = float(scene.rod.length)
-    radius = 0.7 * float(scene.rod.section.radius.base)
+    radius = 0.7 * float(scene.rod.outline(jnp.zeros(())))
     bending = force * length * radius
     arm = tendons.Arm(length, radius, bending)
     rod, actuators = scene.rod, list(scene.actuators)
@@ -116,7 +116,7 @@ def drawn(effects: frozenset[str], random: np.random.Generator) -> check.Drawn |
         actuators.append(vsr.Tendon(path, discs=4))
         inputs = jnp.append(inputs, tendons.pull(arm, random))
     loads = [*scene.loads, *pose_loads(effects, arm, random)]
-    free = {} if plain.free is None else {"free_strains": plain.free}
+    free: dict[str, Any] = {} if plain.free is None else {"free_strains": plain.free}
     without = vsr.Scene(rod, actuators, loads, **free)
     around = surroundings(effects, without, inputs, random)
     if around is None:
