@@ -9,7 +9,12 @@ both modes. The error of a difference is estimated from those of other step size
 the solve is smooth are used; a scene with too few of them is counted as at a switch.
 """
 
-from collections.abc import Callable
+import argparse
+import json
+import time
+from collections.abc import Callable, Iterable
+from itertools import combinations
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -18,12 +23,38 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 import vsr_jax as vsr
+from vsr_jax.cli.common import reduce_compile_time
 
 SAME = 1e-7
 """Largest difference between two derivatives that count as the same, as a share of the
 derivative."""
 WIDEST, HALVINGS = 0.02, 10
 """Largest step of the differences as a share of each number, and the number of halvings."""
+
+
+def covering(
+    effects: tuple[str, ...],
+    size: int,
+    candidate: Callable[[], frozenset[str]],
+    number: int,
+    first: Iterable[frozenset[str]] = (),
+) -> list[frozenset[str]]:
+    """Subsets of effects: the first ones, then repeatedly the one of a hundred candidates that adds
+    the most on-off combinations of so many effects."""
+
+    def covered(chosen: frozenset[str]) -> set:
+        return {
+            (names, tuple(name in chosen for name in names))
+            for names in combinations(effects, size)
+        }
+
+    found = list(first)
+    seen = set[Any]().union(*map(covered, found))
+    while len(found) < number:
+        every = (candidate() for _ in range(100))
+        found.append(max(every, key=lambda chosen: len(covered(chosen) - seen)))
+        seen |= covered(found[-1])
+    return found[:number]
 
 
 class Drawn(NamedTuple):
@@ -206,3 +237,43 @@ HEADER = (
     "rough | wrong "
     "| forward - reverse | forward - differences |\n|" + "---|" * 10
 )
+
+
+class Job(NamedTuple):
+    """A structure to be searched: its name, what the record says of it, and the search."""
+
+    name: str
+    record: dict[str, Any]
+    search: Callable[[], list[Found]]
+
+
+def parser(description: str | None, draws: int) -> argparse.ArgumentParser:
+    """The options of a search, by default with so many draws."""
+    made = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    made.add_argument("--structures", type=int, default=12)
+    made.add_argument(
+        "--draws", type=int, default=draws, help="draws per structure (default: %(default)s)"
+    )
+    made.add_argument("--json", metavar="FILE")
+    return made
+
+
+def run(jobs: Iterable[Job], record: dict[str, Any], path: str | None) -> None:
+    """Search structure by structure, with a line of the table and the record after each."""
+    reduce_compile_time(optimise=False)  # nothing is timed
+    jax.config.update("jax_enable_x64", True)
+    print(HEADER)
+    rows: list[dict[str, Any]] = []
+    for job in jobs:
+        began = time.perf_counter()
+        # the programs of a structure are used once and take hundreds of megabytes
+        jax.clear_caches()
+        found = job.search()
+        row = {**job.record, **summary(found)}
+        print(line(job.name, row), f"{time.perf_counter() - began:.0f} s", flush=True)
+        rows.append({**row, "found": [[verdict(one), *one] for one in found]})
+        if path:
+            whole = {**record, "jax": jax.__version__, "structures": rows}
+            Path(path).write_text(json.dumps(whole, indent=1) + "\n", encoding="utf-8")

@@ -11,21 +11,14 @@ A function of the tip's pose, the thread forces and the slack is differentiated 
 distributed differently over the pieces of the arm, are left out.
 """
 
-import argparse
-import json
-import time
 from collections.abc import Iterable
 from functools import partial
-from itertools import combinations
-from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 import vsr_jax as vsr
-from vsr_jax.cli.common import reduce_compile_time
 
 try:
     from benchmarks import gradient_check as check
@@ -92,14 +85,8 @@ def structure(effects: frozenset[str]) -> Structure:
 
 
 def structures(number: int) -> list[Structure]:
-    """All effects together, then repeatedly the one of a hundred random subsets that adds the most
-    on-off combinations of three effects."""
-    random, seen = np.random.default_rng(SEED), set()
-
-    def triples(effects: frozenset[str]) -> set:
-        return {
-            (names, tuple(name in effects for name in names)) for names in combinations(EFFECTS, 3)
-        }
+    """All effects together, then those that cover the on-off combinations of three effects."""
+    random = np.random.default_rng(SEED)
 
     def candidate() -> frozenset[str]:
         chosen = {
@@ -107,13 +94,8 @@ def structures(number: int) -> list[Structure]:
         }
         return frozenset(chosen | {NEEDS[name] for name in chosen & set(NEEDS)})
 
-    found: list[frozenset[str]] = [frozenset(EFFECTS)]
-    while len(found) < number:
-        seen |= triples(found[-1])
-        found.append(
-            max((candidate() for _ in range(100)), key=lambda effects: len(triples(effects) - seen))
-        )
-    return [structure(effects) for effects in found[:number]]
+    every = check.covering(EFFECTS, 3, candidate, number, [frozenset(EFFECTS)])
+    return [structure(effects) for effects in every]
 
 
 class Arm(NamedTuple):
@@ -238,51 +220,32 @@ def search(made: Structure, draws: int, model: Any = None) -> list[check.Found]:
     )
 
 
+def job(made: Structure, draws: int, *, basis: bool) -> check.Job:
+    """The search of a structure, in a prescribed `basis` too."""
+
+    def found() -> list[check.Found]:
+        family = vsr.Basis.uniform(vsr.Legendre(2), *(() if made.free is None else (made.free,)))
+        return search(made, draws, vsr.Prescribed(family, steps=STEPS) if basis else None)
+
+    name = (", ".join(made.effects) or "tendons alone") + " (Prescribed)" * basis
+    model = "Prescribed" if basis else "StrainDependent"
+    return check.Job(name, {"model": model, **made._asdict()}, found)
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--structures", type=int, default=12)
-    parser.add_argument(
-        "--draws", type=int, default=17, help="draws per structure (default: %(default)s)"
-    )
+    """Run the search."""
+    parser = check.parser(__doc__, draws=17)
     parser.add_argument(
         "--prescribed",
         type=int,
         default=2,
         help="structures to solve also in a prescribed basis (default: %(default)s)",
     )
-    parser.add_argument("--json", metavar="FILE")
     options = parser.parse_args()
-    reduce_compile_time(optimise=False)  # nothing is timed
-    jax.config.update("jax_enable_x64", True)
-    print(check.HEADER)
-    rows = []
     chosen = structures(options.structures)
-    for made, basis in [
-        *((made, False) for made in chosen),
-        *((made, True) for made in chosen[: options.prescribed]),
-    ]:
-        began = time.perf_counter()
-        # the programs of a structure are used once and take hundreds of megabytes
-        jax.clear_caches()
-        family = vsr.Basis.uniform(vsr.Legendre(2), *(() if made.free is None else (made.free,)))
-        found = search(made, options.draws, vsr.Prescribed(family, steps=STEPS) if basis else None)
-        name = ", ".join(made.effects) or "tendons alone"
-        row = {
-            "model": "Prescribed" if basis else "StrainDependent",
-            **made._asdict(),
-            **check.summary(found),
-        }
-        print(
-            check.line(name + " (Prescribed)" * basis, row),
-            f"{time.perf_counter() - began:.0f} s",
-            flush=True,
-        )
-        rows.append({**row, "found": [[check.verdict(one), *one] for one in found]})
-    if options.json:
-        record = {"seed": SEED, "steps": STEPS, "jax": jax.__version__, "structures": rows}
-        Path(options.json).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    jobs = [job(made, options.draws, basis=False) for made in chosen]
+    jobs += [job(made, options.draws, basis=True) for made in chosen[: options.prescribed]]
+    check.run(jobs, {"seed": SEED, "steps": STEPS}, options.json)
 
 
 if __name__ == "__main__":

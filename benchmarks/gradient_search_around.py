@@ -12,11 +12,7 @@ differentiated as in `gradient_check.py`. Points where other contacts push than 
 left out too.
 """
 
-import argparse
-import json
-import time
-from itertools import combinations
-from pathlib import Path
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -25,7 +21,6 @@ import jax.numpy as jnp
 import numpy as np
 
 import vsr_jax as vsr
-from vsr_jax.cli.common import reduce_compile_time
 
 try:
     from benchmarks import gradient_check as check, gradient_search as tendons
@@ -67,27 +62,15 @@ class Shape(NamedTuple):
 
 
 def structures(number: int) -> list[frozenset[str]]:
-    """Repeatedly the one of a hundred random subsets that adds the most on-off combinations of two
-    effects."""
-    random, found = np.random.default_rng(SEED), list[frozenset[str]]()
-    seen: set = set()
-
-    def pairs(effects: frozenset[str]) -> set:
-        return {
-            (names, tuple(name in effects for name in names)) for names in combinations(EFFECTS, 2)
-        }
+    """Those that cover the on-off combinations of two effects."""
+    random = np.random.default_rng(SEED)
 
     def candidate() -> frozenset[str]:
         chosen = {name for name in (*PLAIN, *MORE) if random.random() < OFTEN}
         chosen |= set(random.choice(OBSTACLES, random.integers(3), replace=False).tolist())
         return frozenset(chosen | {"length"} if "elastic" in chosen else chosen)
 
-    while len(found) < number:
-        found.append(
-            max((candidate() for _ in range(100)), key=lambda effects: len(pairs(effects) - seen))
-        )
-        seen |= pairs(found[-1])
-    return found
+    return check.covering(EFFECTS, 2, candidate, number)
 
 
 def drawn(effects: frozenset[str], random: np.random.Generator) -> check.Drawn | None:
@@ -255,35 +238,17 @@ def search(effects: frozenset[str], draws: int) -> list[check.Found]:
     return check.compared(scenes, program, random)
 
 
+def job(effects: frozenset[str], draws: int) -> check.Job:
+    """The search of a structure."""
+    names = [name for name in EFFECTS if name in effects]
+    return check.Job(", ".join(names), {"effects": names}, partial(search, effects, draws))
+
+
 def main() -> None:
     """Run the search."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--structures", type=int, default=12)
-    parser.add_argument(
-        "--draws", type=int, default=8, help="draws per structure (default: %(default)s)"
-    )
-    parser.add_argument("--json", metavar="FILE")
-    options = parser.parse_args()
-    reduce_compile_time(optimise=False)  # nothing is timed
-    jax.config.update("jax_enable_x64", True)
-    print(check.HEADER)
-    rows = []
-    for effects in structures(options.structures):
-        began = time.perf_counter()
-        # the programs of a structure are used once and take hundreds of megabytes
-        jax.clear_caches()
-        found = search(effects, options.draws)
-        names = [name for name in EFFECTS if name in effects]
-        row = {"effects": names, **check.summary(found)}
-        spent = f"{time.perf_counter() - began:.0f} s"
-        print(check.line(", ".join(names), row), spent, flush=True)
-        rows.append({**row, "found": [[check.verdict(one), *one] for one in found]})
-        if options.json:
-            record = {"seed": SEED, "steps": STEPS.steps, "jax": jax.__version__}
-            text = json.dumps({**record, "structures": rows}, indent=1) + "\n"
-            Path(options.json).write_text(text, encoding="utf-8")
+    options = check.parser(__doc__, draws=8).parse_args()
+    jobs = [job(effects, options.draws) for effects in structures(options.structures)]
+    check.run(jobs, {"seed": SEED, "steps": STEPS.steps}, options.json)
 
 
 if __name__ == "__main__":

@@ -42,8 +42,8 @@ def test_the_margin_of_a_held_column_vanishes_at_its_buckling_load(orientation, 
 
 
 def test_a_moment_leaves_a_buckled_arm_stable():
-    """Held at its tip the arm is not symmetric, and its pivots alone miss pairs of the negative
-    eigenvalues that the hold takes away; a margin above zero proves that it is stable."""
+    """With a moment the tangent is not symmetric, and its pivots alone miss pairs of the negative
+    eigenvalues that the hold takes away; a margin above zero proves that the arm is stable."""
     moment = vsr.TipWrench(moment=(*[stiffness() / L] * 3,))
     eq = solved(moment, held=vsr.Held(position=(0.9 * L, 0.1 * L, 0.05 * L)))
     assert eq.status == vsr.Status.CONVERGED

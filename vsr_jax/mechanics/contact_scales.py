@@ -34,7 +34,7 @@ def contacts_of(scene: Scene, sections: CrossSections, grid: Grid) -> Contacts |
     """The contacts of a scene; None if it has no obstacles."""
     if not scene.obstacles:
         return None
-    base = jnp.asarray(base_pose(scene.rod.frame, grid.h.dtype))[:3, 3]
+    base = jnp.asarray(base_pose(scene.rod.base, grid.h.dtype))[:3, 3]
     length = jnp.sum(grid.h)
     bending = jnp.sum(grid.weight * softest(sections.stiffness)) / length
     flatness = _FLATNESS * scene.rod.outline(0.5 * scene.rod.length)

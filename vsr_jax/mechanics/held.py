@@ -303,7 +303,7 @@ def holds_of(scene: Scene, sections: CrossSections, grid: Grid) -> Holds | None:
     base = jnp.asarray(base_pose(scene.rod.frame, grid.h.dtype))
     axes = base[:3, :3]
     rest = stack(tuple(jnp.broadcast_to(x, grid.X.shape) for x in sections.rest))
-    starts, R, end = rotations(rows_of(rest, 0, 3), grid.h, scene.rod.frame)
+    starts, R, end = rotations(rows_of(rest, 0, 3), grid.h, base)
     axis = matvec(R, rows_of(rest, 3, 6))
 
     def hold(held: Held) -> Hold:
