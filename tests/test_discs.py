@@ -132,6 +132,23 @@ def test_a_moment_at_the_tip_leaves_an_arm_with_discs_stable():
     assert jnp.all(margin > 0.5)
 
 
+def test_an_arm_with_discs_under_gravity_is_not_probed():
+    """The pivots leave no doubt where the loads have a potential: probing would take as many steps
+    again."""
+    weighed = scene([vsr.Gravity()], discs=4)
+
+    @jax.jit
+    @jax.vmap
+    def solved(tensions):
+        eq = vsr.solve(weighed, tensions, model=STEPS)
+        return eq.status, eq.stability, eq.steps
+
+    status, margin, steps = solved(jnp.array([[1.0, 0.0], [2.0, 1.0]]))
+    assert jnp.all(status == vsr.Status.CONVERGED)
+    assert jnp.all(margin > 0.4)
+    assert jnp.all(steps <= 12), steps
+
+
 def test_lengths_give_back_the_tensions(weighed):
     driven = scene([vsr.Gravity()], discs=3, control="length")
     changes = weighed.lengths - jnp.array([driven.rest_length(i) for i in range(2)])

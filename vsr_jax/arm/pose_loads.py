@@ -54,6 +54,11 @@ class PoseLoad(Load):
         """What of the pose of the section the wrench depends on."""
         return "pose"
 
+    @property
+    def conservative(self) -> bool:
+        """Whether it has a potential."""
+        return type(self).potential is not PoseLoad.potential
+
     def place(self, rod: Rod) -> Scalar | None:
         """Abscissa [m] where it acts; None for a load per length."""
         return None
@@ -94,6 +99,10 @@ class _ScaledPoseLoad(PoseLoad):
     @property
     def needs(self) -> Needs:
         return self.load.needs
+
+    @property
+    def conservative(self) -> bool:
+        return self.load.conservative
 
     def place(self, rod: Rod) -> Scalar | None:
         return self.load.place(rod)

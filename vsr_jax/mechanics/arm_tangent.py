@@ -87,14 +87,14 @@ def approximate_solve(
     solve = _elimination(lower, along, slopes, grid, free, flexible, apart=apart)
     if along is not None and loads is not None and along.pull is not None:
         chords = along.pull.springs(along.rotation, cut=loads.only_discs)
-        solve = with_springs(solve, chords, grid, apart=apart)
+        solve = with_springs(solve, chords, grid, loads.conservative, apart=apart)
     b = spread(right.wrench, free)
     if sliding is not None:
         b, more = sliding.driven(b)
         pushes = [push + more for push in pushes]
     borders = borders_of(problem, unknown.coupled, at)
     strain, coupled, (negative, doubtful) = _bordered(
-        solve, b, pushes, right.coupled, borders, grid, apart=apart
+        solve, b, pushes, right.coupled, borders, grid, loads, apart=apart
     )
     for place, one in points.items():
         assert along is not None
@@ -155,6 +155,7 @@ def _bordered(
     rows: tuple[PyTree, ...],
     borders: tuple[dict[int, Border], Border | None],
     grid: Grid,
+    loads: Loading | None,
     *,
     apart: bool,
 ) -> tuple[Vector, list[PyTree], Definiteness]:
@@ -172,7 +173,8 @@ def _bordered(
     for place in places:
         size = len(rows[place])
         coupled[place], first = x[first : first + size], first + size
-    return strain, coupled, definiteness.without(held)
+    conservative = loads is None or loads.conservative
+    return strain, coupled, definiteness.without(held, conservative)
 
 
 def tangent_solve(

@@ -35,12 +35,17 @@ class Definiteness(NamedTuple):
     negative: Array
     doubtful: Array
 
-    def without(self, prevented: Array) -> "Definiteness":
+    def without(self, prevented: Array, conservative: Array | bool) -> "Definiteness":
         """That of a tangent in which so many of the motions with negative eigenvalues are
-        prevented. If there are fewer of them, the pivots have missed pairs."""
+        prevented. If there are fewer of them, the pivots have missed pairs.
+
+        Every such motion is a pole of the stiffness beyond a section. Near a pole the errors of the
+        quadrature look like a part without potential, which says nothing if the loads are
+        `conservative`."""
         negative = self.negative - prevented
         missed = negative < 0
-        return Definiteness(jnp.where(missed, negative % 2, negative), self.doubtful | missed)
+        doubtful = self.doubtful & ~(conservative & (prevented > 0))
+        return Definiteness(jnp.where(missed, negative % 2, negative), doubtful | missed)
 
 
 def definiteness(negative: Array, local: Array, asymmetry: Array, grid: Grid) -> Definiteness:

@@ -67,6 +67,15 @@ class Loading(NamedTuple):
         turns = self.by_pose or self.follower_points
         return 3 if turns or self.follower_density is not None or self.discs is not None else 0
 
+    @property
+    def conservative(self) -> Array | bool:
+        """Whether all loads have a potential: no follower loads, no dead moments in space."""
+        if self.follower_density is not None or self.follower_points:
+            return False
+        if not all(term.load.conservative for term in self.by_pose):
+            return False
+        return True if self.dead is None else jnp.all(self.dead[:3] == 0, axis=(0, 1, 2))
+
     def scaled(self, share: Array) -> "Loading":
         """A fraction of all loads."""
         return self._mapped(lambda x: share * x)

@@ -19,13 +19,17 @@ Solve = Callable[..., tuple[Vector, Definiteness]]
 """Solution of a tangent system for several right sides, components (k, stages, steps, ...)."""
 
 
-def with_springs(solve: Solve, springs: Vector, grid: Grid, *, apart: bool) -> Solve:
+def with_springs(
+    solve: Solve, springs: Vector, grid: Grid, conservative: Array | bool, *, apart: bool
+) -> Solve:
     r"""From the `solve` of a tangent A that of $A + \sum_j w_j w_j^T$ (Woodbury's formula).
 
     Its number of negative eigenvalues is that of A, less the number of negative pivots of
     $1 + W^T A^{-1} W$.
 
-    **Arguments:** `apart`: solve for the springs apart from the right sides.
+    **Arguments:**
+    - `conservative`: whether the loads have a potential.
+    - `apart`: solve for the springs apart from the right sides.
     """
     weighted = stack(tuple(grid.weight * w for w in springs))
 
@@ -53,7 +57,7 @@ def with_springs(solve: Solve, springs: Vector, grid: Grid, *, apart: bool) -> S
         force = jax.vmap(partial(lu.substitute, factors), 1, 1)(work(stack(x)))
         less = jnp.einsum("jk...,cjsn...->cksn...", force, answers)
         held = jnp.sum(lu.diagonal(factors) < 0, axis=0, dtype=jnp.int32)
-        return c.subtract(x, components(less)), definiteness.without(held)
+        return c.subtract(x, components(less)), definiteness.without(held, conservative)
 
     return stiffer
 
