@@ -37,15 +37,17 @@ class Definiteness(NamedTuple):
 
     def without(self, prevented: Array, conservative: Array | bool) -> "Definiteness":
         """That of a tangent in which so many of the motions with negative eigenvalues are
-        prevented. If there are fewer of them, the pivots have missed pairs.
+        prevented. If there are fewer of them, the pivots have missed pairs; if there are more, that
+        may be rounding, since a tangent with such motions may be nearly singular.
 
         Every such motion is a pole of the stiffness beyond a section. Near a pole the errors of the
         quadrature look like a part without potential, which says nothing if the loads are
         `conservative`."""
         negative = self.negative - prevented
-        missed = negative < 0
-        doubtful = self.doubtful & ~(conservative & (prevented > 0))
-        return Definiteness(jnp.where(missed, negative % 2, negative), doubtful | missed)
+        some = prevented > 0
+        unlike = some & (negative != 0) & (self.negative < UNSTABLE_SECTION)
+        doubtful = jnp.where(some & conservative, unlike, self.doubtful | unlike)
+        return Definiteness(jnp.where(negative < 0, negative % 2, negative), doubtful)
 
 
 def definiteness(negative: Array, local: Array, asymmetry: Array, grid: Grid) -> Definiteness:

@@ -40,7 +40,7 @@ _SETTLED = 0.3
 begins."""
 _SLIDING, _CLOSE = 20, 1e-3
 """Bound on the evaluations of a first attempt where something slides with friction, and size of a
-step below which the attempt may take twice as many."""
+step below which the attempt may take twice as many, and a doubtful sign may be rounding."""
 _ACCEPTED = 64
 """Largest accepted residual, in multiples of its rounding level."""
 _MAX_RISES = 3
@@ -85,6 +85,8 @@ def damped_newton(
       constraints hold by a wide margin, the last stage follows at once. Nearly exact constraints
       that jump without end are loosened where they are. A problem that ends without a stable root
       begins once more, slowly, loosened and with harder springs.
+    - Single precision. Near the solution, a doubtful tangent is taken to be as definite as the one
+      before it: rounding may change a sign. It is probed in the end.
     - Friction. What `slides` has no energy: its steps are accepted where the residual becomes
       smaller, else halved, some times. Its first attempt has at most `_SLIDING` evaluations, near
       the solution twice as many.
@@ -299,6 +301,9 @@ class _Method(NamedTuple):
             share = share + jnp.maximum(applied - self.increments, 0.0) / self.stages
         damped = jnp.where(probe, _PROBE_DAMPING, damping)
         new = self.evaluate(point, damped, share, old.loose)
+        if self.floor.dtype == jnp.float32:
+            same = old.definite & new.doubtful & (new.size < _CLOSE)
+            new = new._replace(definite=new.definite | same)
         left = self.measures.work(new.residual, step)
         # the stages that are nearly exact have no energy
         hard = (old.gradual | (not self.twice)) & (applied >= self.increments + SOFT_STAGES)
