@@ -20,7 +20,8 @@ def solved(stiffness, says_definite, dtype, cubic=1.0):
         definite = says_definite(size, damping)
         return Damped(step, size, residual, jnp.linalg.norm(residual), definite, jnp.array(True))
 
-    measures = Measures(lambda residual, step: jnp.sum(residual * step), jnp.linalg.norm)
+    stirs = jnp.array([0.6, 0.8], dtype)
+    measures = Measures(lambda r, step: jnp.sum(r * step), jnp.linalg.norm, stirs)
     floor = jnp.asarray(4 * jnp.finfo(dtype).eps, dtype)
     return iterated(damped_newton(evaluate, measures, jnp.zeros(2, dtype), floor))
 

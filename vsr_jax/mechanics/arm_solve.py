@@ -180,6 +180,12 @@ class _Sizes(NamedTuple):
         angle = total(jnp.abs(cast(bending, self.problem.grid.h.dtype)), 0)
         return _over_nodes(self.problem.grid.weight * angle)
 
+    def stirs(self, like: _Point) -> _Point:
+        """A step that bends and twists the arm in all directions, in no symmetric way."""
+        bending, place = sum(i < 3 for i in self.free), self.problem.grid.X / self.problem.length
+        some = jnp.stack([jnp.cos(i + 3 * place) * (i < bending) for i in range(len(self.free))])
+        return _Point(some / self.problem.length, jax.tree.map(jnp.zeros_like, like.coupled))
+
     def work(self, wrench: Vector, step: _Point) -> Array:
         """Work of the residual over a step, in single precision: only its sign and rough size
         matter."""
@@ -289,11 +295,10 @@ def _iteration(
         wrench = c.single(imbalance.wrench)
         return Damped(point, size, wrench, merit, definite, doubtful, clear, slides)
 
+    dot = sizes.dot if whole.follows_rate or whole.softens else None
     return damped_newton(
         evaluate,
-        Measures(
-            sizes.work, sizes.turn, sizes.dot if whole.follows_rate or whole.softens else None
-        ),
+        Measures(sizes.work, sizes.turn, sizes.stirs(start), dot),
         start,
         floor,
         1 if whole.loads is None or whole.begins_soft else LOAD_INCREMENTS,

@@ -305,8 +305,15 @@ def _solve(basis: NodalBasis, problem: ArmProblem) -> Root:
     first = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(x), *arms)), first)
     floor = jnp.broadcast_to(rounding_of(problem), arms)
     shares = 1 if problem.loads is None else LOAD_INCREMENTS
-    measures = Measures(work, turn, dot if problem.follows_rate else None)
+    stirs = jax.tree.map(jnp.zeros_like, first)._replace(q=_stirs(K, arms))
+    measures = Measures(work, turn, stirs, dot if problem.follows_rate else None)
     return iterated(damped_newton(evaluate, measures, first, floor, shares))
+
+
+def _stirs(K: Array, arms: tuple[int, ...]) -> Array:
+    """A step of all coordinates, in no symmetric way."""
+    some = jnp.cos(jnp.arange(len(K), dtype=K.dtype)).reshape(-1, *(1,) * len(arms))
+    return some * jnp.sqrt(K[0, 0] / lu.diagonal(K))
 
 
 def _doubtful(J: Array, elastic: Array) -> Array:

@@ -91,8 +91,8 @@ def damped_newton(
       smaller, else halved, some times. Its first attempt has at most `_SLIDING` evaluations, near
       the solution twice as many.
     - Probing. Where the tangent is doubtful at the end, the arm is moved from the solution by the
-      last step, made small, and creeps: $s_{n+1} = s_n + (H + \mu \Sigma)^{-1} r(x - s_n)$. The
-      solution is unstable if the motion grows after some steps.
+      last step and by one that stirs all motions, made small, and creeps: $s_{n+1} = s_n + (H + \mu
+      \Sigma)^{-1} r(x - s_n)$. The solution is unstable if the motion grows after some steps.
     - Last step. Near the solution, where the last step and residual were at most `_CERTAIN` of
       those before, the next step is taken without another evaluation if what it leaves, by the
       same ratio or the rate of linear convergence, is negligible and accepted.
@@ -286,7 +286,7 @@ class _Method(NamedTuple):
         """The next evaluation, and whether its step is taken."""
         x, step, _, old = state
         probe = self._probing(old)
-        step = rules.shrunk(step, probe, self.measures.turn)
+        step = rules.shrunk(step, probe, old.probes == 0, self.measures)
         bound = MAX_STAGED_STEPS if self.stages else MAX_DAMPED_STEPS
         plain = (old.spent >= bound) | (old.damping >= _MAX_DAMPING) | (old.plain > 0)
         point = jax.tree.map(lambda a, s: jnp.where(old.fresh, a - s.astype(a.dtype), a), x, step)

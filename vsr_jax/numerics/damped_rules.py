@@ -54,11 +54,12 @@ class Damped(NamedTuple):
 
 class Measures(NamedTuple):
     """Measures of steps for `damped_newton`, with one entry per problem: `work`, the scalar product
-    of a residual and a step; `turn`, a norm of a step; and `dot`, the scalar product of two, where
-    convergence may be linear."""
+    of a residual and a step; `turn`, a norm of a step; a step that `stirs` all motions, of size 1
+    or so; and `dot`, the scalar product of two, where convergence may be linear."""
 
     work: Callable[[Any, Any], Array]
     turn: Callable[[Any], Array]
+    stirs: Any
     dot: Callable[[Any, Any], Array] | None = None
 
 
@@ -129,10 +130,14 @@ def careful(floor: Array, increments: int) -> Guard:
     )
 
 
-def shrunk(step: Any, probe: Array, turn: Callable[[Any], Array]) -> Any:
+def shrunk(step: Any, probe: Array, first: Array, measures: Measures) -> Any:
     """The steps, those of a probe made so small that the residual is linear and so large that its
-    rounding is small."""
-    size = turn(step)
+    rounding is small; the `first` one also stirs the motions that a symmetric problem never makes.
+    """
+    size = measures.turn(step)
+    stir = jnp.where(probe & first, jnp.where(size > 0, size, 1.0), 0.0)
+    step = jax.tree.map(lambda s, d: s + (stir * d).astype(s.dtype), step, measures.stirs)
+    size = measures.turn(step)
     scale = jnp.finfo(size.dtype).eps ** 0.25 / jnp.where(size > 0, size, 1.0)
     scale = jnp.where(probe, scale, 1.0)
     return jax.tree.map(lambda s: scale.astype(s.dtype) * s, step)
