@@ -403,3 +403,17 @@ def test_a_tapered_arm_of_silicone_upright_under_its_weight_is_unstable():
 
     found = jax.jit(jax.vmap(status))(jnp.array([0.0, 100.0]))
     assert list(found) == [UNSTABLE, vsr.Status.CONVERGED]
+
+
+@pytest.mark.parametrize(("force", "moment"), [((5.59, 0.48), 5.37), ((1.4, -2.7), 5.7)])
+def test_an_arm_in_a_plane_that_is_unstable_across_it_is_found_out(force, moment):
+    """A dead moment bends the arm in the plane of all loads. Its tangent has a pair of eigenvalues
+    with the real part -0.69 or -0.23, of motions across that plane, which no step contains and the
+    pivots miss."""
+    rod = vsr.Rod(LENGTH, vsr.Circular(0.01), vsr.Material(1e6, poisson=0.45))
+    unit = BENDING / LENGTH**2
+    load = vsr.TipWrench(
+        force=(force[0] * unit, force[1] * unit, 0.0), moment=(0.0, 0.0, moment * unit * LENGTH)
+    )
+    eq = vsr.solve(vsr.Scene(rod, loads=[load]), jnp.zeros(0), model=vsr.StrainDependent(12))
+    assert eq.status == vsr.Status.UNSTABLE

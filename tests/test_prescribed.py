@@ -186,6 +186,20 @@ def test_legendre_bases_converge_geometrically(capsys):
         assert fine < coarse / 4
 
 
+@pytest.mark.parametrize("angle", [2.5, 5.0])
+def test_a_dead_moment_bends_an_arm_to_an_arc(angle):
+    """Its tangent is far from symmetric: two of its pivots are negative, the real parts of all its
+    eigenvalues above 0.9 of the elastic stiffness."""
+    length, young, radius = 0.3, 1e6, 0.01
+    rod = vsr.Rod(length, vsr.Circular(radius), vsr.Material(young, poisson=0.45))
+    moment = angle * young * np.pi / 4 * radius**4 / length
+    scene = vsr.Scene(rod, loads=[vsr.TipWrench(moment=(0.0, 0.0, moment))])
+    model = vsr.Prescribed(vsr.Basis.uniform(vsr.Legendre(3)), steps=16)
+    eq = vsr.solve(scene, jnp.zeros(0), model=model, throw=True)
+    arc = length / angle * np.array([np.sin(angle), 1 - np.cos(angle), 0.0])
+    np.testing.assert_allclose(eq.tip[:3, 3], arc, atol=1e-10)
+
+
 def test_only_the_named_strains_move():
     basis = vsr.Basis({"bending_z": vsr.Legendre(2)})
     eq = vsr.solve(paper.scene("A2"), jnp.array([-10.0]), model=vsr.Prescribed(basis))

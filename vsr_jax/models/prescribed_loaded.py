@@ -282,14 +282,17 @@ def _solve(basis: NodalBasis, problem: ArmProblem) -> Root:
         cut = MAX_TURN / jnp.maximum(turn, MAX_TURN)
         # couplings prevent as many unstable motions as their own rows have negative pivots
         falling = lu.diagonal(factors) <= 0
-        definite = jnp.sum(falling[:size], axis=0) == jnp.sum(falling[size:], axis=0)
+        unlike = jnp.sum(falling[:size], axis=0) - jnp.sum(falling[size:], axis=0)
+        doubtful = _doubtful(J[:size, :size], elastic)
+        # a pair of negative pivots means nothing if the tangent is far from symmetric
+        definite = (unlike == 0) | (doubtful & (unlike % 2 == 0))
         return Damped(
             jax.tree.map(lambda x: cut * x, step),
             sizes.of_step(step, at),
             r.q,
             sizes.of_imbalance(r, at),
             definite,
-            _doubtful(J[:size, :size], elastic),
+            doubtful,
         )
 
     def work(force: Array, step: GalerkinUnknown) -> Array:
