@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, PyTree
 
@@ -182,8 +183,9 @@ class _Sizes(NamedTuple):
 
     def stirs(self, like: _Point) -> _Point:
         """A step that bends and twists the arm in all directions, in no symmetric way."""
-        bending, place = sum(i < 3 for i in self.free), self.problem.grid.X / self.problem.length
-        some = jnp.stack([jnp.cos(i + 3 * place) * (i < bending) for i in range(len(self.free))])
+        place, bending = self.problem.grid.X / self.problem.length, sum(i < 3 for i in self.free)
+        index = np.arange(len(self.free)).reshape(-1, *(1,) * place.ndim)
+        some = jnp.where(index < bending, jnp.cos(index + 3 * place), 0.0)
         return _Point(some / self.problem.length, jax.tree.map(jnp.zeros_like, like.coupled))
 
     def work(self, wrench: Vector, step: _Point) -> Array:
