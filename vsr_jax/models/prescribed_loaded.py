@@ -280,19 +280,12 @@ def _solve(basis: NodalBasis, problem: ArmProblem) -> Root:
         step = _split(lu.substitute(factors, _row(c.single(r))).astype(K.dtype), unknown)
         turn = sizes.turn(step.q)
         cut = MAX_TURN / jnp.maximum(turn, MAX_TURN)
-        # couplings prevent as many unstable motions as their own rows have negative pivots
-        falling = lu.diagonal(factors) <= 0
-        unlike = jnp.sum(falling[:size], axis=0) - jnp.sum(falling[size:], axis=0)
-        doubtful = _doubtful(J[:size, :size], elastic)
-        # a pair of negative pivots means nothing if the tangent is far from symmetric
-        definite = (unlike == 0) | (doubtful & (unlike % 2 == 0))
         return Damped(
             jax.tree.map(lambda x: cut * x, step),
             sizes.of_step(step, at),
             r.q,
             sizes.of_imbalance(r, at),
-            definite,
-            doubtful,
+            *_definiteness(factors, J, elastic),
         )
 
     def work(force: Array, step: GalerkinUnknown) -> Array:
@@ -317,6 +310,18 @@ def _stirs(K: Array, arms: tuple[int, ...]) -> Array:
     """A step of all coordinates, in no symmetric way."""
     some = jnp.cos(jnp.arange(len(K), dtype=K.dtype)).reshape(-1, *(1,) * len(arms))
     return some * jnp.sqrt(K[0, 0] / lu.diagonal(K))
+
+
+def _definiteness(factors: Array, J: Array, elastic: Array) -> tuple[Array, Array]:
+    """Whether the tangent is positive definite for the changes of shape that the couplings allow,
+    and whether that is doubtful."""
+    size = len(elastic)
+    # couplings prevent as many unstable motions as their own rows have negative pivots
+    falling = lu.diagonal(factors) <= 0
+    unlike = jnp.sum(falling[:size], axis=0) - jnp.sum(falling[size:], axis=0)
+    doubtful = _doubtful(J[:size, :size], elastic)
+    # a pair of negative pivots means nothing if the tangent is far from symmetric
+    return (unlike == 0) | (doubtful & (unlike % 2 == 0)), doubtful
 
 
 def _doubtful(J: Array, elastic: Array) -> Array:

@@ -135,12 +135,12 @@ def shrunk(step: Any, probe: Array, first: Array, measures: Measures) -> Any:
     rounding is small; the `first` one also stirs the motions that a symmetric problem never makes.
     """
     size = measures.turn(step)
-    stir = jnp.where(probe & first, jnp.where(size > 0, size, 1.0), 0.0)
-    step = jax.tree.map(lambda s, d: s + (stir * d).astype(s.dtype), step, measures.stirs)
-    size = measures.turn(step)
-    scale = jnp.finfo(size.dtype).eps ** 0.25 / jnp.where(size > 0, size, 1.0)
-    scale = jnp.where(probe, scale, 1.0)
-    return jax.tree.map(lambda s: scale.astype(s.dtype) * s, step)
+    small = jnp.finfo(size.dtype).eps ** 0.25
+    scale = jnp.where(probe, small / jnp.where(size > 0, size, 1.0), 1.0)
+    stir = jnp.where(probe & first, small, 0.0)
+    return jax.tree.map(
+        lambda s, d: scale.astype(s.dtype) * s + (stir * d).astype(s.dtype), step, measures.stirs
+    )
 
 
 def probed(old: Guard, probe: Array, ratio: Array) -> Guard:
