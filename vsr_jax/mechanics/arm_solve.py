@@ -185,7 +185,7 @@ class _Sizes(NamedTuple):
         """A step that bends and twists the arm in all directions, in no symmetric way."""
         place, bending = self.problem.grid.X / self.problem.length, sum(i < 3 for i in self.free)
         index = np.arange(len(self.free), dtype=place.dtype).reshape(-1, *(1,) * place.ndim)
-        some = jnp.where(index < bending, jnp.cos(index + 3 * place), 0.0)
+        some = jnp.where(index < bending, 1.0 - (0.4 + 0.5 * index) * place, 0.0)
         some = c.times(self.problem.sections.flexible, some)
         return _Point(some / self.problem.length, jax.tree.map(jnp.zeros_like, like.coupled))
 
