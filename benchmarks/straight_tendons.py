@@ -3,7 +3,9 @@ disc to disc: distance of the tips over the number of discs.
 
 The arm is one section of the robot in the published code of Rao et al. 2021 (see
 docs/validation.md): a wire with a Young's modulus of 54 GPa, 1.4 mm thick and 200 mm long, with
-holes at 10 mm from it. Run it, in some minutes, with
+holes at 10 mm from it. The whole robot, of two such sections with three tendons each, is compared
+with the equations of that code and with an independent solution (see `rods_between_discs.py`). Run
+it, in five to ten minutes, with
 
     python benchmarks/straight_tendons.py --plot benchmarks/results/straight_tendons.png
         --json benchmarks/results/straight_tendons.json
@@ -21,6 +23,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 import vsr_jax as vsr
+
+try:
+    from benchmarks import rods_between_discs as independent
+except ModuleNotFoundError:  # as a script
+    import rods_between_discs as independent
 
 LENGTH, RADIUS, YOUNG, OFFSET = 0.2, 0.7e-3, 54e9, 0.01
 BENDING = YOUNG * np.pi * RADIUS**4 / 4
@@ -70,6 +77,85 @@ def shapes(discs: int | None) -> dict[str, np.ndarray]:
     for name, case in CASES.items():
         scene = vsr.Scene(rod, [vsr.Tendon(case.routing, discs=discs)], case.loads)
         found[name] = np.asarray(vsr.solve(scene, [case.tension], model=model).position(X))
+    return found
+
+
+class Inputs(NamedTuple):
+    """Tensions [N] of the robot's tendons, three to the end of each section, and the force at its
+    tip [N]."""
+
+    tensions: tuple[float, ...]
+    force: tuple[float, float, float]
+
+
+ROBOT_CASES = {
+    "4 N and 2 N, as in the published example": Inputs((4, 0, 0, 0, 2, 0), (0, 0, 0)),
+    "4 N to the tip alone": Inputs((0, 0, 0, 0, 4, 0), (0, 0, 0)),
+    "4 N and 2 N, 0.1 N across the tip": Inputs((4, 0, 0, 0, 2, 0), (0, 0.1, 0)),
+    "6, 4 and 3 N, 0.12 N at the tip": Inputs((6, 0, 0, 0, 4, 3), (-0.05, 0.05, 0.1)),
+}
+ROBOT_DISCS = 5, 10
+"""In each of its two sections."""
+_PLACES = np.pi / 2, -np.pi / 6, 7 * np.pi / 6
+SECTIONS = 1, 1, 1, 2, 2, 2
+HOLES = OFFSET * np.array([[np.cos(angle), np.sin(angle)] for angle in 2 * _PLACES])
+
+
+def robot(discs: int | None) -> vsr.Scene:
+    """The robot with its discs, or with tendons along the section; the force is to be put in."""
+    material = vsr.Material(YOUNG, poisson=0.3)
+    rod = vsr.Rod(2 * LENGTH, vsr.Circular(RADIUS), material, guide_radius=1.01 * OFFSET)
+    tendons = [
+        vsr.Tendon(vsr.Parallel(*hole), end=sections * LENGTH, discs=discs and sections * discs)
+        for hole, sections in zip(HOLES, SECTIONS, strict=True)
+    ]
+    return vsr.Scene(rod, tendons, [vsr.TipWrench()])
+
+
+def rods(discs: int, inputs: Inputs) -> independent.Robot:
+    """The same for the independent solution."""
+    shear, area = YOUNG / 2.6, np.pi * RADIUS**2
+    return independent.Robot(
+        np.full(2 * discs, LENGTH / discs),
+        np.array([2 * shear * BENDING / YOUNG, *[BENDING] * 2, YOUNG * area, *[shear * area] * 2]),
+        HOLES,
+        discs * np.array(SECTIONS),
+        np.array(inputs.tensions, float),
+        np.array(inputs.force, float),
+    )
+
+
+def compared(discs: int) -> dict[str, dict[str, float]]:
+    """Distances of the tips in percent of the robot's length, by case: of a tendon along the
+    section from that of straight ones here and by the published equations; of straight ones here
+    from the published equations, and from the same with the term that they leave out."""
+    model = vsr.StrainDependent(8 * discs)
+
+    def tips(scene: vsr.Scene) -> Any:
+        def tip(tensions: jax.Array, force: jax.Array) -> jax.Array:
+            loaded = scene.replace("loads[0].force", force)
+            return vsr.solve(loaded, tensions, model=model).tip[:3, 3]
+
+        return jax.jit(tip)
+
+    usual, straight = tips(robot(None)), tips(robot(discs))
+    found = {}
+    for name, case in ROBOT_CASES.items():
+        numbers = [jnp.array(x, float) for x in case]
+        along, here = np.asarray(usual(*numbers)), np.asarray(straight(*numbers))
+        published, whole = (
+            independent.solve(rods(discs, case), axial=axial)[-1] for axial in (False, True)
+        )
+        pairs = {
+            "along the section, straight": (along, here),
+            "along the section, published": (along, published),
+            "straight, published": (here, published),
+            "straight, independent": (here, whole),
+        }
+        found[name] = {
+            pair: float(f"{100 * np.linalg.norm(a - b) / (2 * LENGTH):.3g}")
+            for pair, (a, b) in pairs.items()
+        }
     return found
 
 
@@ -142,6 +228,11 @@ def main() -> None:
         print(
             f"{name}:", *record[name]["percent"], f"% of the length, order {record[name]['order']}"
         )
+    record["robot"] = {str(n): compared(n) for n in ROBOT_DISCS}
+    for n, cases in record["robot"].items():
+        print(f"robot with {n} discs in each section, distance of the tips [% of the length]")
+        for name, pairs in cases.items():
+            print(f"  {name}:", ", ".join(f"{pair} {x}" for pair, x in pairs.items()))
     if options.json:
         Path(options.json).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     if options.plot:

@@ -9,6 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 import vsr_jax as vsr
+from benchmarks import rods_between_discs, straight_tendons
 from vsr_jax.files.scene_file import parse_scene, to_toml
 
 LENGTH, RADIUS, YOUNG = 0.3, 0.01, 1e6
@@ -67,6 +68,17 @@ def test_an_arm_in_a_plane_is_that_of_a_separate_integration(discs, tension):
     np.testing.assert_allclose(eq.tip[:2, 3], place, atol=1e-8)
     chord = np.hypot(x - 0.007 * np.sin(angle), y + 0.007 * (np.cos(angle) - 1))
     np.testing.assert_allclose(eq.lengths, [discs * chord], rtol=1e-8)
+
+
+def test_a_robot_of_two_sections_is_that_of_rods_between_its_discs():
+    """Six tendons run through the same discs, so that nearly all pieces of the arm are empty."""
+    discs, length = 3, 2 * straight_tendons.LENGTH
+    places = jnp.linspace(0, length, 2 * discs + 1)
+    for case in list(straight_tendons.ROBOT_CASES.values())[-2:]:
+        arm = straight_tendons.robot(discs).replace("loads[0].force", case.force)
+        found = vsr.solve(arm, case.tensions, throw=True).position(places)
+        expected = rods_between_discs.solve(straight_tendons.rods(discs, case), axial=True)
+        np.testing.assert_allclose(found, expected, atol=2e-6 * length)
 
 
 @pytest.mark.parametrize("discs", [1, 3])

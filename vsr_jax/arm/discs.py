@@ -18,19 +18,27 @@ from .rod import Rod
 from .routing import thread_tangent
 
 
-def inner_discs(rod: Rod, actuators: Sequence[Actuator]) -> Iterator[Scalar]:
-    """Abscissas [m] of the discs between the ends of the straight tendons of an arm. Evenly spaced
+def inner_discs(rod: Rod, actuators: Sequence[Actuator]) -> Iterator[tuple[Scalar, ...]]:
+    """Abscissas [m] of the discs between the ends of each straight tendon of an arm. Evenly spaced
     discs on the whole arm that several tendons share come once."""
     known: set[float] = set()
     for actuator in actuators:
         if not actuator.straight:
             continue
         holes, number = actuator.holes(rod.length), actuator.even_discs
-        for i in range(1, holes.size - 1):
-            if number is None or i / number not in known:
-                yield holes[i]
-            if number is not None:
-                known.add(i / number)
+        places = range(1, holes.size - 1)
+        yield tuple(holes[i] for i in places if number is None or i / number not in known)
+        if number is not None:
+            known.update(i / number for i in places)
+
+
+def shared_discs(rod: Rod, actuators: Sequence[Actuator]) -> int:
+    """Most breakpoints of straight tendons that lie where another one does, and leave a piece of
+    the arm empty: all but those of the tendon with the most."""
+    straight = [actuator for actuator in actuators if actuator.straight]
+    ends = [(actuator.start is not None) + (actuator.end is not None) for actuator in straight]
+    own = [len(inner) + end for inner, end in zip(inner_discs(rod, straight), ends, strict=True)]
+    return sum(own) - max(own, default=0)
 
 
 def check_discs(name: str, actuator: Actuator, length: Scalar) -> None:

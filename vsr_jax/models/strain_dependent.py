@@ -52,7 +52,7 @@ class StrainDependent(SteppedModel):
 
     **Arguments:**
     - `steps`: steps along the arm, at least one on each smooth piece, the others distributed by
-      length.
+      length. Further ones are added where several tendons run through the same discs.
     - `order`: order of the steps, 2, 4 (Zanna's, eq. 5) or 6, with one, two or three nodes per
       step.
     """

@@ -249,7 +249,8 @@ class _Trial(StrainDependent):
         self.wanted = wanted
 
     def grid(self, scene: Scene) -> Grid:
-        return make_grid(scene.edges(), self.wanted, self.order // 2, room=self.steps)
+        more = scene.shared_discs
+        return make_grid(scene.edges(), self.wanted + more, self.order // 2, room=self.steps + more)
 
 
 def _tip_of(scene: Scene, inputs: Array, model: StrainDependent) -> tuple[Array, Array]:
