@@ -70,6 +70,7 @@ def solve(robot: Robot, *, axial: bool) -> np.ndarray:
 
 
 def _newton(robot: Robot, x: np.ndarray, axial: bool) -> np.ndarray:
+    """Root of the residual, from x; a step that does not lower it is halved."""
     moves = DIFFERENCE * np.eye(len(x))
     for _ in range(MOST_ITERATIONS):
         r = residual(robot, x, axial)
