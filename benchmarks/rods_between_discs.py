@@ -50,11 +50,12 @@ class Robot(NamedTuple):
 
 class Discs(NamedTuple):
     """Rotations (..., discs, 3, 3) and positions (..., discs, 3) of the base and all discs, and the
-    wrench (..., pieces, 6) behind each piece, in the world frame."""
+    wrenches (..., pieces, 6) at the start and at the end of each piece, in the world frame."""
 
     rotation: np.ndarray
     position: np.ndarray
-    wrench: np.ndarray
+    start: np.ndarray
+    end: np.ndarray
 
 
 def solve(robot: Robot, *, axial: bool) -> np.ndarray:
@@ -101,8 +102,9 @@ def discs(robot: Robot, x: np.ndarray) -> Discs:
         R.append(R[-1] @ turns[..., i, :, :])
     rotation, position = np.stack(R, -3), np.stack(p, -2)
     moment, force = (_apply(rotation[..., :-1, :, :], part) for part in np.split(wrench, 2, -1))
+    start = np.concatenate([moment, force], -1)
     moment = moment - np.cross(np.diff(position, axis=-2), force)
-    return Discs(rotation, position, np.concatenate([moment, force], -1))
+    return Discs(rotation, position, start, np.concatenate([moment, force], -1))
 
 
 def _pieces(robot: Robot, wrench: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -131,11 +133,8 @@ def residual(robot: Robot, x: np.ndarray, axial: bool) -> np.ndarray:
     """Moments and forces (..., 6 pieces) that are missing at the discs, without units."""
     at = discs(robot, x)
     R, p = at.rotation, at.position
-    ahead = robot.units * x.reshape(*x.shape[:-1], -1, 6)
-    ahead = np.concatenate([_apply(R[..., :-1, :, :], part) for part in np.split(ahead, 2, -1)], -1)
-    tip = np.concatenate([np.zeros(3), robot.force])
-    beyond = np.concatenate([ahead[..., 1:, :], np.broadcast_to(tip, ahead[..., :1, :].shape)], -2)
-    missing = at.wrench - beyond
+    tip = np.broadcast_to([0, 0, 0, *robot.force], at.start[..., :1, :].shape)
+    missing = at.end - np.concatenate([at.start[..., 1:, :], tip], -2)
     for hole, last, tension in zip(robot.holes, robot.last, robot.tension, strict=True):
         arm = _apply(R, np.array([0.0, *hole]))
         chord = np.diff(p + arm, axis=-2)[..., :last, :]

@@ -29,7 +29,7 @@ try:
 except ModuleNotFoundError:  # as a script
     import rods_between_discs as independent
 
-LENGTH, RADIUS, YOUNG, OFFSET = 0.2, 0.7e-3, 54e9, 0.01
+LENGTH, RADIUS, YOUNG, POISSON, OFFSET = 0.2, 0.7e-3, 54e9, 0.3, 0.01
 BENDING = YOUNG * np.pi * RADIUS**4 / 4
 DISCS = (2, 3, 5, 10, 20)
 PARALLEL, HELIX = vsr.Parallel(OFFSET, 0.0), vsr.Helix(OFFSET, pitch=2 * LENGTH)
@@ -67,13 +67,17 @@ CASES = {
 }
 
 
+def wire(length: float) -> vsr.Rod:
+    """The backbone of one section or of both."""
+    material = vsr.Material(YOUNG, poisson=POISSON)
+    return vsr.Rod(length, vsr.Circular(RADIUS), material, guide_radius=1.01 * OFFSET)
+
+
 def shapes(discs: int | None) -> dict[str, np.ndarray]:
     """Positions [m] along the arm of every case, shape (stations, 3); NaN where there is no stable
     equilibrium."""
     X, model = jnp.linspace(0, LENGTH, 41), vsr.StrainDependent(max(24, discs or 0))
-    material = vsr.Material(YOUNG, poisson=0.3)
-    rod = vsr.Rod(LENGTH, vsr.Circular(RADIUS), material, guide_radius=1.01 * OFFSET)
-    found = {}
+    rod, found = wire(LENGTH), {}
     for name, case in CASES.items():
         scene = vsr.Scene(rod, [vsr.Tendon(case.routing, discs=discs)], case.loads)
         found[name] = np.asarray(vsr.solve(scene, [case.tension], model=model).position(X))
@@ -103,18 +107,16 @@ HOLES = OFFSET * np.array([[np.cos(angle), np.sin(angle)] for angle in 2 * _PLAC
 
 def robot(discs: int | None) -> vsr.Scene:
     """The robot with its discs, or with tendons along the section; the force is to be put in."""
-    material = vsr.Material(YOUNG, poisson=0.3)
-    rod = vsr.Rod(2 * LENGTH, vsr.Circular(RADIUS), material, guide_radius=1.01 * OFFSET)
     tendons = [
         vsr.Tendon(vsr.Parallel(*hole), end=sections * LENGTH, discs=discs and sections * discs)
         for hole, sections in zip(HOLES, SECTIONS, strict=True)
     ]
-    return vsr.Scene(rod, tendons, [vsr.TipWrench()])
+    return vsr.Scene(wire(2 * LENGTH), tendons, [vsr.TipWrench()])
 
 
 def rods(discs: int, inputs: Inputs) -> independent.Robot:
     """The same for the independent solution."""
-    shear, area = YOUNG / 2.6, np.pi * RADIUS**2
+    shear, area = YOUNG / (2 * (1 + POISSON)), np.pi * RADIUS**2
     return independent.Robot(
         np.full(2 * discs, LENGTH / discs),
         np.array([2 * shear * BENDING / YOUNG, *[BENDING] * 2, YOUNG * area, *[shear * area] * 2]),

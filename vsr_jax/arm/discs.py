@@ -18,26 +18,36 @@ from .rod import Rod
 from .routing import thread_tangent
 
 
-def inner_discs(rod: Rod, actuators: Sequence[Actuator]) -> Iterator[tuple[Scalar, ...]]:
-    """Abscissas [m] of the discs between the ends of each straight tendon of an arm. Evenly spaced
-    discs on the whole arm that several tendons share come once."""
+def _own_discs(
+    rod: Rod, actuators: Sequence[Actuator]
+) -> Iterator[tuple[Actuator, Array, list[int]]]:
+    """Each straight tendon of an arm, its holes, and the places among them of the discs between its
+    ends. Evenly spaced discs on the whole arm that several tendons share come once."""
     known: set[float] = set()
     for actuator in actuators:
         if not actuator.straight:
             continue
         holes, number = actuator.holes(rod.length), actuator.even_discs
         places = range(1, holes.size - 1)
-        yield tuple(holes[i] for i in places if number is None or i / number not in known)
+        yield actuator, holes, [i for i in places if number is None or i / number not in known]
         if number is not None:
             known.update(i / number for i in places)
+
+
+def inner_discs(rod: Rod, actuators: Sequence[Actuator]) -> Iterator[Scalar]:
+    """Abscissas [m] of the discs between the ends of the straight tendons of an arm. Evenly spaced
+    discs on the whole arm that several tendons share come once."""
+    for _, holes, places in _own_discs(rod, actuators):
+        yield from (holes[i] for i in places)
 
 
 def shared_discs(rod: Rod, actuators: Sequence[Actuator]) -> int:
     """Most breakpoints of straight tendons that lie where another one does, and leave a piece of
     the arm empty: all but those of the tendon with the most."""
-    straight = [actuator for actuator in actuators if actuator.straight]
-    ends = [(actuator.start is not None) + (actuator.end is not None) for actuator in straight]
-    own = [len(inner) + end for inner, end in zip(inner_discs(rod, straight), ends, strict=True)]
+    own = [
+        len(places) + (actuator.start is not None) + (actuator.end is not None)
+        for actuator, _, places in _own_discs(rod, actuators)
+    ]
     return sum(own) - max(own, default=0)
 
 

@@ -206,7 +206,7 @@ class Scene(Part):
         return (
             *self.rod.breakpoints,
             *laid,
-            *(x for discs in inner_discs(self.rod, self.actuators) for x in discs),
+            *inner_discs(self.rod, self.actuators),
             *(x for load in self.loads for x in load.breakpoints(self.rod)),
             *(held.X for held in self.held if held.X is not None),
         )

@@ -234,10 +234,14 @@ class SteppedModel(Model):
         return ()
 
     def grid(self, scene: Scene) -> Grid:
-        """Steps along the arm and their nodes. Pieces that are empty since tendons share discs have
-        steps of their own, not some of `steps`."""
+        """Steps along the arm and their nodes."""
+        return self._grid(scene, self.steps, self.order // 2)
+
+    def _grid(self, scene: Scene, steps: int, stages: int) -> Grid:
+        """Pieces that are empty since tendons share discs have steps of their own, not some of
+        `steps`."""
         edges = scene.edges(self.breakpoints(scene))
-        return make_grid(edges, self.steps + scene.shared_discs, self.order // 2)
+        return make_grid(edges, steps + scene.shared_discs, stages)
 
     def tip(self, scene: Scene, forces: Forces, state: Any) -> Pose:
         return tip_pose(self.node_strain(scene, state), self.grid(scene).h, scene.rod.frame)
@@ -272,8 +276,7 @@ class SteppedModel(Model):
                 return self._merged(scene, state)
             if self.steps >= _MANY:
                 return self._coarser(scene, inputs, forces, state)
-        edges = scene.edges(self.breakpoints(scene))
-        grid = make_grid(edges, 2 * self.steps + scene.shared_discs, 3)
+        grid = self._grid(scene, 2 * self.steps, 3)
         given, other = self._corrected(scene, inputs, forces, state, grid)
         return Refinement(tip_pose(other, grid.h, scene.rod.frame), grid.X, given, other)
 
