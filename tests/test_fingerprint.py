@@ -40,3 +40,19 @@ def test_a_constant_of_the_program_changes_its_hash(make):
     x = (jnp.array(1.5),)
     assert fingerprint(make(1.0), x) == fingerprint(make(1.0), x)
     assert fingerprint(make(1.0), x) != fingerprint(make(2.0), x)
+
+
+@pytest.mark.skipif(
+    not hasattr(jax.config, "jax_use_simplified_jaxpr_constants"), reason="an option of newer JAX"
+)
+def test_a_constant_that_is_an_operand_changes_the_hash():
+    """JAX prints such an array by its shape only."""
+    name = "jax_use_simplified_jaxpr_constants"
+    before = getattr(jax.config, name)
+    jax.config.update(name, True)
+    try:
+        x = (jnp.array(1.5),)
+        assert fingerprint(under_jit(1.0), x) == fingerprint(under_jit(1.0), x)
+        assert fingerprint(under_jit(1.0), x) != fingerprint(under_jit(2.0), x)
+    finally:
+        jax.config.update(name, before)

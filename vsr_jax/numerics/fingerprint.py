@@ -9,7 +9,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 
 def fingerprint(function: Callable, arguments: Any, *more: Any) -> str:
@@ -22,9 +22,18 @@ def fingerprint(function: Callable, arguments: Any, *more: Any) -> str:
         return whole(*given)
 
     program = jax.make_jaxpr(run)(arrays)
-    constants = [closed.consts for closed in nested(program)]
+    parts = list(nested(program))
+    constants = [part.consts for part in parts]
+    # an array among them is printed by its shape only
+    literals = [
+        atom.val
+        for part in parts
+        for equation in part.jaxpr.eqns
+        for atom in equation.invars
+        if isinstance(atom, Literal)
+    ]
     digest = hashlib.sha256(re.sub(r" at 0x[0-9a-f]+", "", str(program.jaxpr)).encode())
-    for leaf in jax.tree.leaves((constants, arrays, more)):
+    for leaf in jax.tree.leaves((constants, literals, arrays, more)):
         digest.update(np.asarray(leaf).tobytes())
     return digest.hexdigest()
 
@@ -37,7 +46,8 @@ def nested(program: ClosedJaxpr) -> Iterator[ClosedJaxpr]:
         for leaf in jax.tree.leaves(
             list(equation.params.values()), is_leaf=lambda x: isinstance(x, ClosedJaxpr | Jaxpr)
         ):
-            if isinstance(leaf, Jaxpr):
-                leaf = ClosedJaxpr(leaf, ())
+            # since JAX 0.12 both are one class, and a program keeps its own constants
             if isinstance(leaf, ClosedJaxpr):
                 yield from nested(leaf)
+            elif isinstance(leaf, Jaxpr):
+                yield from nested(ClosedJaxpr(leaf, ()))
