@@ -10,6 +10,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ..numerics.component import norm, split
+from ..numerics.quadrature import ascending
 from ..typing import ArrayLike, MatrixLike, Pose, Scalar
 from ..validation import concrete, numbers, rigid
 from .functions import Position
@@ -143,7 +144,7 @@ class Curve(NamedTuple):
         inner = self.knots[:-1, None] + share * jnp.diff(self.knots)[:, None]
         samples = jnp.append(inner.reshape(-1), self.knots[-1])
         kinks = [jnp.clip(x, 0, self.knots[-1])[None] for x in self.radius.breakpoints]
-        return jnp.sort(jnp.concatenate([samples, *kinks])) if kinks else samples
+        return ascending(jnp.concatenate([samples, *kinks])) if kinks else samples
 
     def at(self, s: Scalar) -> tuple[Position, Array, Array]:
         """Point at an abscissa [m], and its first two derivatives."""

@@ -37,7 +37,20 @@ def piece_edges(length: Scalar, breakpoints: tuple[Scalar, ...]) -> Float[Array,
     """Ends of the pieces of [0, L] in ascending order; breakpoints beyond the arm make empty pieces
     at its ends."""
     inner = [jnp.clip(point, 0, length) for point in breakpoints]
-    return jnp.sort(jnp.stack([jnp.zeros_like(length), *inner, length]))
+    ends = jnp.stack([jnp.zeros_like(length), *inner, length])
+    return ascending(ends) if inner else ends
+
+
+def ascending(values: Float[Array, " values"]) -> Float[Array, " values"]:
+    """A few values in ascending order, each placed by the number of those before it.
+
+    XLA cannot store a program with a sort of its own (JAX 0.12), so that it would compile in every
+    process.
+    """
+    place = jnp.arange(values.size)
+    first = (values < values[:, None]) | ((values == values[:, None]) & (place < place[:, None]))
+    there = jnp.sum(first, axis=1)[:, None] == place
+    return jnp.sum(jnp.where(there, values[:, None], 0.0), axis=0)
 
 
 def make_grid(
