@@ -45,11 +45,11 @@ jax.config.update("jax_traceback_in_locations_limit", 0)  # nobody reads them, a
 gc.freeze()
 gc.set_threshold(200_000, 50, 1000)
 
-from vsr_jax.analysis import progress  # noqa: E402
+from vsr_jax.numerics import compiling  # noqa: E402
 from vsr_jax.studies import paper  # noqa: E402
 
-# On a slow machine commands would say that they compile wherever a test reads what they print.
-progress.SILENT = 1e6
+# On a slow machine programs would say that they compile wherever a test reads what they print.
+compiling.SILENT = 1e6
 
 
 def epsilon(dtype) -> float:
@@ -93,6 +93,7 @@ def earlier_programs_are_dropped():
     maps = Path("/proc/self/maps")
     if maps.exists() and maps.read_bytes().count(b"\n") > 20_000:
         jax.clear_caches()
+        compiling.drop_programs()
         gc.collect()
 
 

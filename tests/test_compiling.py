@@ -1,10 +1,10 @@
-"""Compiled programs kept between runs of the command."""
+"""Programs of the package: compiled quickly at first, better later, and kept on disk."""
 
-import argparse
 import gc
 import os
 import subprocess
 import sys
+import threading
 import time
 
 import jax
@@ -13,12 +13,17 @@ import numpy as np
 import pytest
 
 import vsr_jax as vsr
-from vsr_jax.analysis import progress
-from vsr_jax.cli import compiling
-from vsr_jax.numerics.compiling import quick_jit
+from vsr_jax.numerics import compiling, program_store
+from vsr_jax.numerics.compiling import program
 from vsr_jax.studies import paper
 
 MAIN = "import sys; from vsr_jax.cli.main import main; sys.exit(main())"
+
+
+@pytest.fixture
+def as_installed(monkeypatch):
+    """Without the compiler settings of the tests."""
+    monkeypatch.setenv("XLA_FLAGS", "")
 
 
 def run(folder, scene, *arguments):
@@ -30,7 +35,7 @@ def run(folder, scene, *arguments):
 
 
 def programs(folder):
-    return sorted(path.name for path in folder.iterdir() if path.name.endswith("-cache"))
+    return sorted(path.name for path in folder.iterdir())
 
 
 @pytest.mark.slow
@@ -48,13 +53,172 @@ def test_a_second_run_adds_no_program_and_says_the_same(tmp_path):
 
 def test_the_folder_is_that_of_the_variable_or_the_users(monkeypatch, tmp_path):
     monkeypatch.setenv("VSR_JAX_CACHE", str(tmp_path))
-    assert compiling.cache_folder() == tmp_path
+    assert program_store.folder() == tmp_path
     monkeypatch.setenv("VSR_JAX_CACHE", "off")
-    assert compiling.cache_folder() is None
+    assert program_store.folder() is None
     monkeypatch.delenv("VSR_JAX_CACHE")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "users"))
     monkeypatch.setattr(sys, "platform", "linux")
-    assert compiling.cache_folder() == tmp_path / "users" / "vsr_jax"
+    assert program_store.folder() == tmp_path / "users" / "vsr_jax"
+
+
+def made(shift=0.0):
+    """A program, a new one each time."""
+
+    @program("cube")
+    def cube(x):
+        return {"cube": x**3 + shift, "kind": "cube"}
+
+    return cube
+
+
+def compiled(monkeypatch):
+    """The compiler options of each program that XLA compiles from now on."""
+    seen, compile = [], jax.stages.Lowered.compile
+
+    def counted(self, compiler_options=None, **more):
+        seen.append(compiler_options)
+        return compile(self, compiler_options, **more)
+
+    monkeypatch.setattr(jax.stages.Lowered, "compile", counted)
+    return seen
+
+
+def test_a_program_is_kept_and_found_by_another_of_the_same_code(monkeypatch, tmp_path):
+    monkeypatch.setenv("VSR_JAX_CACHE", str(tmp_path))
+    seen, x = compiled(monkeypatch), jnp.arange(3.0)
+    np.testing.assert_array_equal(made()(x)["cube"], x**3)
+    assert len(programs(tmp_path)) == len(seen) == 1
+    np.testing.assert_array_equal(made()(x)["cube"], x**3)
+    assert len(seen) == 1
+    np.testing.assert_array_equal(made(2.0)(x)["cube"], x**3 + 2)
+    np.testing.assert_array_equal(made()(x.astype("float32"))["cube"], x**3)
+    assert len(programs(tmp_path)) == len(seen) == 3
+    assert jax.config.jax_compilation_cache_dir is None, "the cache of the user's programs"
+
+
+def summed(size):
+    table = jnp.full(4, size)
+    return program("sum")(lambda x: x * table.sum())
+
+
+def test_a_constant_of_the_function_is_part_of_the_program(monkeypatch, tmp_path):
+    monkeypatch.setenv("VSR_JAX_CACHE", str(tmp_path))
+    assert summed(1.0)(jnp.ones(())) == 4.0
+    assert summed(2.0)(jnp.ones(())) == 8.0
+
+
+@pytest.mark.parametrize("content", [b"", b"no program", None])
+def test_a_damaged_program_is_compiled_again(monkeypatch, tmp_path, content):
+    monkeypatch.setenv("VSR_JAX_CACHE", str(tmp_path))
+    x = jnp.arange(3.0)
+    made()(x)
+    (path,) = tmp_path.iterdir()
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2] if content is None else content)
+    seen = compiled(monkeypatch)
+    np.testing.assert_array_equal(made()(x)["cube"], x**3)
+    assert len(seen) == 1
+    assert path.stat().st_size == pytest.approx(len(whole), rel=0.01)
+
+
+def test_a_folder_that_cannot_be_written_is_not_used(monkeypatch, tmp_path):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("VSR_JAX_CACHE", str(tmp_path / "file" / "folder"))
+    assert made()(jnp.array(2.0))["cube"] == 8.0
+
+
+@pytest.mark.parametrize(("most", "left"), [(25, ["b", "c"]), (100, ["a", "b", "c"]), (0, [])])
+def test_the_programs_used_longest_ago_are_removed_first(tmp_path, most, left):
+    for age, name in enumerate("cba"):
+        path = tmp_path / f"{name}.program"
+        path.write_bytes(bytes(10))
+        os.utime(path, (1000 - age, 1000 - age))
+    (tmp_path / "other").write_bytes(bytes(100))
+    program_store.remove_oldest(tmp_path, most)
+    assert sorted(path.stem for path in tmp_path.iterdir()) == [*left, "other"]
+
+
+QUICK = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+
+
+def improver_is_done():
+    for thread in threading.enumerate():
+        if thread.name == "vsr_jax compiler":
+            thread.join(60)
+
+
+def test_a_program_that_runs_for_long_is_compiled_again(monkeypatch, as_installed):
+    seen, cube, x = compiled(monkeypatch), made(), jnp.arange(3.0)
+    first = cube(x)
+    assert seen == [QUICK]
+    monkeypatch.setattr(compiling, "LONG", -1.0)
+    cube(x)
+    improver_is_done()
+    assert seen == [QUICK, {}]
+    np.testing.assert_allclose(cube(x)["cube"], first["cube"], rtol=1e-15)
+    improver_is_done()
+    assert seen == [QUICK, {}]
+
+
+def test_the_better_of_two_kept_programs_is_used(monkeypatch, tmp_path, as_installed):
+    monkeypatch.setenv("VSR_JAX_CACHE", str(tmp_path))
+    monkeypatch.setattr(compiling, "LONG", -1.0)
+    seen, x = compiled(monkeypatch), jnp.arange(3.0)
+    made()(x)
+    improver_is_done()
+    made()(x)
+    improver_is_done()
+    assert seen == [QUICK, {}]
+
+
+def test_one_tier_has_the_defaults_of_the_compiler(monkeypatch, as_installed):
+    monkeypatch.setenv("VSR_JAX_TIERS", "off")
+    seen = compiled(monkeypatch)
+    monkeypatch.setattr(compiling, "LONG", -1.0)
+    made()(jnp.arange(3.0))
+    improver_is_done()
+    assert seen == [{}]
+
+
+def test_a_process_ends_while_a_program_is_compiled_again():
+    """Quietly, with all that was printed, after the program at work and not the others."""
+    script = """
+import jax, time, jax.numpy as jnp
+from vsr_jax.numerics import compiling
+compiling.LONG = -1.0
+slow = compiling._Kind.improve
+def improve(self):
+    time.sleep(0.5)
+    slow(self)
+    print("improved", flush=True)
+compiling._Kind.improve = improve
+for n in range(3):
+    compiling.program("cube")(lambda x: x**3 + n)(jnp.ones(2))
+print("done")
+"""
+    environment = os.environ | {"XLA_FLAGS": "", "VSR_JAX_CACHE": "off"}
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.split() == ["done", "improved"]
+
+
+@pytest.mark.parametrize("silent", [0.0, 10.0])
+def test_a_program_says_that_it_compiles_if_that_takes_long(monkeypatch, capsys, silent):
+    monkeypatch.setattr(compiling, "SILENT", silent)
+
+    @program("reach")
+    def slow(x):
+        time.sleep(0.3)
+        return x
+
+    slow(jnp.ones(2))
+    assert capsys.readouterr().err == ("" if silent else "vsr_jax: compiling reach\n")
+    slow(jnp.ones(2))
+    with compiling.messages(False):
+        slow(jnp.ones(3))
+    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize("enabled", [True, False])
@@ -62,7 +226,7 @@ def test_nothing_looks_for_garbage_while_a_program_is_traced(enabled):
     """Afterwards as before, also where tracing fails."""
     seen = []
 
-    @quick_jit
+    @program("traced")
     def traced(x):
         seen.append(gc.isenabled())
         return x.reshape(1)
@@ -79,57 +243,10 @@ def test_nothing_looks_for_garbage_while_a_program_is_traced(enabled):
     assert seen == [False, False]
 
 
-@pytest.mark.parametrize(("most", "left"), [(25, ["b", "c"]), (100, ["a", "b", "c"]), (0, [])])
-def test_the_programs_used_longest_ago_are_removed_first(tmp_path, most, left):
-    for age, name in enumerate("cba"):
-        (tmp_path / name).write_bytes(bytes(10))
-        os.utime(tmp_path / name, (1000 - age, 1000 - age))
-    compiling.remove_oldest(tmp_path, most)
-    assert sorted(path.name for path in tmp_path.iterdir()) == left
-
-
-def test_a_command_that_was_silent_for_long_says_that_it_compiles(monkeypatch, capsys):
-    with compiling.compiling(argparse.Namespace(no_cache=True)):
-        time.sleep(0.05)
-    assert capsys.readouterr().err == ""
-    monkeypatch.setattr(progress, "SILENT", 0.0)
-    with compiling.compiling(argparse.Namespace(no_cache=True)):
-        time.sleep(0.5)
-    assert capsys.readouterr().err == "vsr-jax: compiling\n"
-
-
-def test_a_command_with_a_progress_bar_says_nothing_beside_it(monkeypatch, capsys):
-    monkeypatch.setattr(progress, "SILENT", 0.0)
-    with compiling.compiling(argparse.Namespace(no_cache=True, progress_bar=True)):
-        time.sleep(0.3)
-    assert capsys.readouterr().err == ""
-
-
-def reached(scene, target, **options):
-    return vsr.reach(scene, target, (0.0, 12.0), model=vsr.StrainDependent(4), **options)
-
-
-@pytest.mark.slow
-def test_reach_says_that_it_compiles_but_not_the_second_time(monkeypatch, capsys):
-    monkeypatch.setattr(progress, "SILENT", 0.0)
-    arm = vsr.Rod(0.3, vsr.Circular(0.01), vsr.Material(8e5, poisson=0.45))
-    scene = vsr.Scene(arm, [vsr.Tendon(vsr.Parallel(0.005, 0.0))])
-    target = vsr.solve(scene, [3.0]).tip[:3, 3]
-    reached(scene, target)
-    assert capsys.readouterr().err == "vsr_jax.reach: compiling\n"
-    found = reached(scene, target)
-    assert capsys.readouterr().err == ""
-    np.testing.assert_allclose(found.tip[:3, 3], target, atol=1e-4)
-    np.testing.assert_array_equal(found.tip, found.equilibrium.tip)
-    jax.clear_caches()
-    reached(scene, target, progress=False)
-    assert capsys.readouterr().err == ""
-
-
-def test_a_quick_program_goes_through_all_transformations():
+def test_a_program_goes_through_all_transformations():
     calls = []
 
-    @quick_jit
+    @program("cube")
     def cube(x, shift=0.0):
         calls.append(1)
         return x**3 + shift
@@ -143,8 +260,37 @@ def test_a_quick_program_goes_through_all_transformations():
     np.testing.assert_allclose(jax.vmap(cube)(jnp.arange(3.0)), [0.0, 1.0, 8.0])
 
 
-def test_errors_of_a_quick_program_are_its_own():
-    @quick_jit
+def test_a_program_is_that_of_the_arguments_and_settings():
+    @program("scaled")
+    def scaled(x, factor, more):
+        return x * factor + jnp.arange(3).sum() * more["one"]
+
+    x = jnp.ones(2)
+    assert scaled(x, 2, {"one": 1.0}).dtype == x.dtype
+    np.testing.assert_array_equal(scaled(x, 3, {"one": 1.0}), [6.0, 6.0])
+    np.testing.assert_array_equal(scaled(x, 3, {"one": jnp.array(2.0)}), [9.0, 9.0])
+    assert scaled(x.astype("float32"), 3.0, {"one": 1}).dtype == "float32"
+    with jax.enable_x64(False):
+        assert scaled(jnp.ones(2), 2, {"one": 1.0}).dtype == "float32"
+    with jax.disable_jit():
+        np.testing.assert_array_equal(scaled(x, 3, {"one": 1.0}), [6.0, 6.0])
+
+
+def test_a_method_is_a_program_of_its_object():
+    class Box:
+        def __init__(self, size):
+            self.size = size
+
+        @program("volume")
+        def volume(self, x):
+            return x * self.size
+
+    assert Box(2.0).volume(jnp.ones(())) == 2.0
+    assert Box(3.0).volume(jnp.ones(())) == 3.0
+
+
+def test_errors_of_a_program_are_its_own():
+    @program("refuses")
     def refuses(x):
         raise ValueError("x: got a number, need none")
 
@@ -154,10 +300,28 @@ def test_errors_of_a_quick_program_are_its_own():
 
 def test_quick_options_are_taken_and_leave_what_a_user_has_set(monkeypatch):
     options, level = vsr.quick_compilation, "xla_backend_optimization_level"
-    known = jax.default_backend() == "cpu" and jax.__version_info__ < (0, 11)
+    known = jax.default_backend() == "cpu"
     assert jax.jit(lambda x: x + 1, compiler_options=options())(1.0) == 2.0
     for flags, expected in ((f"--{level}=0", False), ("", known)):
         monkeypatch.setenv("XLA_FLAGS", flags)
         assert (level in options()) == expected
+    assert jax.jit(lambda x: x + 2, compiler_options=options())(1.0) == 3.0
     options().clear()
     assert options() or not known, "a user's changes reach the package"
+
+
+@pytest.mark.slow
+def test_both_tiers_solve_alike(monkeypatch, as_installed):
+    """The catheter under loads, as a user runs it."""
+    arm = vsr.Rod(0.3, vsr.Circular(0.001), vsr.Material(60e6, poisson=0.4, density=1100.0))
+    tendons = [vsr.Tendon(vsr.Parallel(0.0008, 0.0)), vsr.Tendon(vsr.Parallel(0.0, 0.0008))]
+    scene = vsr.Scene(arm, tendons, loads=[vsr.Gravity(), vsr.TipWrench(force=(0.0, 1e-3, 0.0))])
+    quick = vsr.solve(scene, [0.1, 0.2])
+    monkeypatch.setattr(compiling, "LONG", -1.0)
+    seen = compiled(monkeypatch)
+    vsr.solve(scene, [0.1, 0.2])
+    improver_is_done()
+    assert {} in seen
+    best = vsr.solve(scene, [0.1, 0.2])
+    np.testing.assert_allclose(best.tip, quick.tip, atol=1e-12)
+    assert best.steps == quick.steps

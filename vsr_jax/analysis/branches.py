@@ -29,7 +29,7 @@ from ..mechanics.balance import free_components, spread, with_locked
 from ..mechanics.coupling import ArmProblem, forces_at
 from ..models.base import Outcome, Status, resolved
 from ..models.strain_dependent import StrainDependent
-from ..numerics.compiling import quick_jit
+from ..numerics.compiling import program
 from ..numerics.component import add, multiply, subtract
 from ..numerics.quadrature import Grid
 from ..solution.equilibrium import Equilibrium
@@ -201,7 +201,7 @@ def _at_nodes(unknown: ArmUnknown, grid: Grid) -> ArmUnknown:
     return unknown._replace(xi=xi)
 
 
-@quick_jit
+@program("follow_branch")
 def _follow(
     scene: SceneOrPath, path: InputPath, start: Equilibrium, points: int, step: Array
 ) -> Branch:

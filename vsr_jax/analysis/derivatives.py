@@ -17,7 +17,7 @@ from ..arm.scene import Scene
 from ..arm.scene_numbers import parameters, replaced
 from ..mechanics.balance import free_block, tangent
 from ..numerics import component as c
-from ..numerics.compiling import quick_jit
+from ..numerics.compiling import program
 from ..numerics.se3 import skew, unskew
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
@@ -88,7 +88,7 @@ def sensitivity(eq: Equilibrium) -> Sensitivity:
     )
 
 
-@quick_jit
+@program("sensitivity")
 def _by_numbers(eq: Equilibrium) -> tuple[Array, Array, Array]:
     numbers = {name: parameter.value for name, parameter in parameters(eq.scene).items()}
 
@@ -121,7 +121,7 @@ def tip_jacobian(eq: Equilibrium) -> Float[Array, "6 inputs"]:
     return _by_inputs(eq)
 
 
-@quick_jit
+@program("tip_jacobian")
 def _by_inputs(eq: Equilibrium) -> Array:
     def motion(inputs: Array) -> Array:
         found = solve(eq.scene, inputs, model=eq.model, start=_near(eq))
@@ -145,7 +145,7 @@ def compliance(eq: Equilibrium) -> Float[Array, "6 6"]:
     return _compliance(eq)
 
 
-@quick_jit
+@program("compliance")
 def _compliance(eq: Equilibrium) -> Array:
     if eq.scene.coupled or not eq.model.balanced_everywhere:
         found = jax.jacfwd(lambda wrench: _motion(_pushed(eq, wrench).tip, eq.tip))(

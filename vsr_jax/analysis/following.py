@@ -28,7 +28,7 @@ from jaxtyping import Array
 from ..arm.scene import Scene
 from ..models.base import Near, Outcome, Status
 from ..models.strain_dependent import StrainDependent
-from ..numerics.compiling import quick_jit
+from ..numerics.compiling import program
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import checked_outcome, near_of
 from ..typing import cast
@@ -103,7 +103,7 @@ def _start(start: Equilibrium, scene: Scene, model: StrainDependent) -> Near:
     return near._replace(scene=scene)
 
 
-@quick_jit
+@program("follow")
 def _follow(scene: Scene, before: Near, inputs: Array) -> Outcome:
     model = before.model
     assert isinstance(model, StrainDependent)

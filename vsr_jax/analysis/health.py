@@ -20,12 +20,11 @@ from ..arm.scene import Scene
 from ..files.output import plain
 from ..mechanics.balance import free_components, thread_direction, thread_wrench
 from ..models.base import Model, Status
-from ..numerics.compiling import quick_jit
+from ..numerics.compiling import program
 from ..numerics.component import norm, scale, split, times
 from ..numerics.quadrature import make_grid
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
-from ..solution.summary import values_of
 from ..typing import Scalar
 from ..validation import is_traced
 from .plausible import strain_warnings, warnings_of
@@ -170,9 +169,8 @@ class Health(NamedTuple):
         return [(name, limit) for name, limit in limits if limit is not None]
 
     def _margins(self) -> tuple[float, float]:
-        """Stability margin and condition number, from one program."""
-        values = values_of(self.equilibrium, ("stability", "condition"))
-        return float(values["stability"]), float(values["condition"])
+        """Stability margin and condition number."""
+        return float(self.equilibrium.stability), float(self.equilibrium.condition)
 
     def _digits(self, condition: float) -> str:
         if not np.isfinite(condition):
@@ -215,7 +213,7 @@ def check(scene: Scene, inputs: ArrayLike | Sequence, *, model: Model | None = N
     return _check(solve(scene, inputs, model=model))
 
 
-@quick_jit
+@program("check")
 def _check(eq: Equilibrium) -> Health:
     scene, inputs, model = eq.scene, eq.inputs, eq.model
     finer = solve(scene, inputs, model=model.finer())

@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float
 from ..arm.scene import Scene
 from ..models.base import Model
 from ..numerics import bounded_least_squares
-from ..numerics.compiling import quick_jit
+from ..numerics.compiling import messages, program
 from ..numerics.component import norm, split
 from ..numerics.se3 import rotation_vector
 from ..solution.equilibrium import Equilibrium
@@ -34,7 +34,6 @@ from ..typing import Pose, Scalar, cast
 from ..validation import instance, instances, interval, is_traced, numbers, on_arm, positive, rigid
 from .constraint import Constraint
 from .margins import margins_of, shortfall, violation
-from .progress import compiling, message_when_slow
 
 _SAMPLES, _STARTS = 512, 6
 """Random inputs, and the starts chosen among them."""
@@ -155,7 +154,7 @@ def reach(
     if start is not None:
         start = lax.stop_gradient(cast(_check_start(start, low), aim.dtype))
     problem = _ReachProblem(scene, aim, stations, low, high, kept, model, start)
-    with message_when_slow("vsr_jax.reach: compiling", start=False, shown=progress):
+    with messages(progress):
         return _reach(problem, allowed)
 
 
@@ -257,9 +256,8 @@ def _check_start(start: Reach, low: Array) -> Reach:
     return start
 
 
-@quick_jit
+@program("reach")
 def _reach(problem: _ReachProblem, allowed: Scalar) -> Reach:
-    compiling()
     still = _still(problem)
     enough = jnp.minimum(allowed / still.scene.rod.length, _CLOSE_ENOUGH[still.target.dtype.name])
     starts = _starts(problem) if problem.start is None else still.idle[None]

@@ -28,14 +28,13 @@ from jaxtyping import Array, Bool, Float
 from ..arm.scene import Scene
 from ..models.base import Model
 from ..numerics import bounded_least_squares
-from ..numerics.compiling import quick_jit
+from ..numerics.compiling import messages, program
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
 from ..typing import Scalar, VectorLike, cast
 from ..validation import concrete, count, instance, instances, interval, is_traced
 from .constraint import Constraint
 from .margins import margins_of, shortfall, violation
-from .progress import compiling, message_when_slow
 
 _BOWS, _TRIED = (0.02, 0.05, 0.1, 0.2, 0.35, 0.5), 12
 """How far the control points of each start are from the straight line at most, as a fraction of the
@@ -131,7 +130,7 @@ def find_path(
     scene, model, kept = cast((scene, model, kept), start.dtype)
     curve = jnp.asarray(_bernstein(samples, count("bends", bends) + 1), start.dtype)
     problem = _PathProblem(scene, start, end, low, high, kept, model, curve)
-    with message_when_slow("vsr_jax.find_path: compiling", start=False, shown=progress):
+    with messages(progress):
         return _find_path(problem)
 
 
@@ -186,9 +185,8 @@ class _PathProblem(NamedTuple):
         return shortfall(self.margins(self.at(share))).reshape(-1)
 
 
-@quick_jit
+@program("find_path")
 def _find_path(problem: _PathProblem) -> InputPath:
-    compiling()
     arrays, others = eqx.partition(problem, eqx.is_inexact_array)
     problem = eqx.combine(lax.stop_gradient(arrays), others)
     rest = problem.straight[1:-1].reshape(-1)

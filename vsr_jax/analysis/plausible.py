@@ -8,13 +8,13 @@ doubtful. No number is rejected here.
 from collections.abc import Iterator
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
 from ..arm.scene import Scene
+from ..numerics.compiling import program
 from ..solution.equilibrium import Equilibrium
 from ..validation import is_traced
 
@@ -155,7 +155,7 @@ def _moduli(material: dict[str, np.ndarray]) -> Iterator[str]:
         )
 
 
-@eqx.filter_jit
+@program("check")
 def _measured(scene: Scene) -> _Measures:
     rod, zero = scene.rod, jnp.zeros_like(scene.rod.length)
 
@@ -172,7 +172,7 @@ def _measured(scene: Scene) -> _Measures:
     return jax.vmap(at)(jnp.linspace(0, 1, _STATIONS) * rod.length)
 
 
-@eqx.filter_jit
+@program("check")
 def _largest_strain(eq: Equilibrium) -> Array:
     nodes, rod = eq.nodes, eq.scene.rod
     zero = jnp.zeros_like(rod.length)

@@ -3,12 +3,12 @@ chords between them on the arm at rest."""
 
 from collections.abc import Iterator, Sequence
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..numerics.compiling import program
 from ..numerics.component import dot, times
 from ..numerics.magnus import step_poses
 from ..numerics.quadrature import Grid, make_grid, piece_edges
@@ -68,7 +68,7 @@ def steps_before(grid: Grid, X: Array) -> Array:
     return jnp.sum(middle < X.reshape(-1, *(1,) * middle.ndim), axis=1)
 
 
-@eqx.filter_jit
+@program("rest_length")
 def rest_length(rod: Rod, actuator: Actuator) -> Scalar:
     """Length [m] of a thread on the arm at rest: of its path, or the sum of its chords."""
     holes = actuator.holes(rod.length)

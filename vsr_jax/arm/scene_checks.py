@@ -3,12 +3,12 @@ arm, and the room that obstacles leave to the arm at rest."""
 
 from collections.abc import Callable, Sequence
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..numerics.compiling import program
 from ..numerics.magnus import step_poses
 from ..numerics.quadrature import make_grid
 from ..typing import Scalar
@@ -108,7 +108,7 @@ def check_held(rod: Rod, held: Sequence[Held]) -> None:
             )
 
 
-@eqx.filter_jit
+@program("Scene")
 def _probe(
     rod: Rod, actuators: tuple[Actuator, ...], edges: Array
 ) -> tuple[Array, Limits, list[Array]]:
@@ -169,7 +169,7 @@ def check_obstacles(
             )
 
 
-@eqx.filter_jit
+@program("Scene")
 def _at_rest(rod: Rod, edges: Array) -> tuple[Array, Array, Array]:
     """Abscissas [m] along the arm, its positions there at rest, and the radii of its outline."""
     grid = make_grid(edges, _STEPS, 3)
@@ -179,6 +179,6 @@ def _at_rest(rod: Rod, edges: Array) -> tuple[Array, Array, Array]:
     return X, poses[:, :3, 3], jax.vmap(rod.outline)(X)
 
 
-@eqx.filter_jit
+@program("Scene")
 def _distances(obstacle: Obstacle, positions: Array) -> Array:
     return jax.vmap(obstacle.distance)(positions)

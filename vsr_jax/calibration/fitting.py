@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from ..arm.scene import Scene
 from ..models.base import Model
+from ..numerics.compiling import messages
 from ..validation import choice, count, instance
 from .assignment import adjusted
 from .least_squares import LOSSES
@@ -92,9 +93,10 @@ def _starts(problem: FitProblem, number: int, seed: int) -> list[np.ndarray]:
 
 def _best(problem: FitProblem, starts: list[np.ndarray], progress: bool) -> Fit:
     found: list[tuple[FitProblem, Adjusted]] = []
-    with tqdm(unit=" steps", disable=not progress) as bar:
+    with tqdm(unit=" steps", disable=not progress, desc="compiling") as bar, messages(False):
 
         def report(step: int, cost: float) -> None:
+            bar.set_description("")
             bar.set_postfix_str(f"start {len(found) + 1} of {len(starts)}, cost {cost:.4g}")
             bar.update()
 

@@ -17,7 +17,7 @@ from ..arm.scene_numbers import parameters, replaced
 from ..models.base import Model, Near, Outcome
 from ..models.strain_dependent import StrainDependent
 from ..numerics import se3
-from ..numerics.compiling import quick_jit
+from ..numerics.compiling import program
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import outcome_of
 from .observation import Observation
@@ -204,12 +204,12 @@ def _in_chunks(
     )
 
 
-@quick_jit
+@program("fit")
 def _residuals(predictor: Predictor, numbers: Array, *known: Any) -> tuple[Array, Outcome]:
     return jax.vmap(predictor.residual)(numbers, *known)
 
 
-@quick_jit
+@program("fit")
 def _linearised(
     predictor: Predictor,
     numbers: Array,

@@ -1,8 +1,7 @@
-"""Shared by the commands of `vsr-jax`: exit codes, help format, common arguments, settings of the
-compiler. Does not import JAX, which the help does not need."""
+"""Shared by the commands of `vsr-jax`: exit codes, help format, common arguments, precision.
+Does not import JAX, which the help does not need."""
 
 import argparse
-import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -93,6 +92,16 @@ def add_precision(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_cache(parser: argparse.ArgumentParser) -> None:
+    """Adds `--no-cache`: nothing is read from the folder of compiled programs, nor stored there."""
+    parser.add_argument(
+        "--no-cache",
+        action="store_true",
+        help="compile everything again and keep nothing; VSR_JAX_CACHE=off does the same for every "
+        "command, VSR_JAX_CACHE=FOLDER moves the cache",
+    )
+
+
 def set_precision(precision: str) -> None:
     """Enables double precision in JAX if needed; call it before any array is created."""
     import jax
@@ -132,21 +141,3 @@ def draw_without_display() -> None:
     import matplotlib
 
     matplotlib.use("Agg")
-
-
-def reduce_compile_time(*, optimise: bool) -> None:
-    """Halves the compile time of a program that runs once, unless XLA_FLAGS is set; call it before
-    any computation.
-
-    XLA then emits CPU kernels without MLIR, whose passes take about 10 ms per kernel; without
-    `optimise` it also skips its own optimisation passes. XLA aborts on unknown flags, so they are
-    set only for releases that know them.
-    """
-    import jax
-
-    if jax.__version_info__ < (0, 11):
-        flags = (
-            "--xla_cpu_use_fusion_emitters=false",
-            *["--xla_backend_optimization_level=0"] * (not optimise),
-        )
-        os.environ.setdefault("XLA_FLAGS", " ".join(flags))

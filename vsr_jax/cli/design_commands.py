@@ -13,15 +13,14 @@ from .common import (
     DONE,
     NOT_CONVERGED,
     Commands,
+    add_cache,
     add_precision,
     check_folders,
     command,
     draw_without_display,
-    reduce_compile_time,
     set_precision,
     warn,
 )
-from .compiling import add_cache
 
 
 def add_design(commands: Commands) -> None:
@@ -63,14 +62,12 @@ def add_design(commands: Commands) -> None:
     )
     add_precision(parser)
     add_cache(parser)
-    parser.set_defaults(progress_bar=True)
 
 
 def _design(options: argparse.Namespace) -> int:
     from ..optimization.design_file import load_design
     from ..optimization.design_search import design
 
-    reduce_compile_time(optimise=True)
     set_precision(options.precision)
     check_folders(options.out, options.json, options.plot, options.checkpoint)
     problem = load_design(options.problem)

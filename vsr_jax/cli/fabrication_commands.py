@@ -11,7 +11,6 @@ from .common import (
     Commands,
     check_folders,
     command,
-    reduce_compile_time,
     set_precision,
     warn,
 )
@@ -78,7 +77,6 @@ def add_export(commands: Commands) -> None:
 def _export(options: argparse.Namespace) -> int:
     from ..fabrication.exporting import DISCS, fabrication_of
 
-    reduce_compile_time(optimise=False)
     files = {name: getattr(options, name) for name in _FILES}
     check_folders(*files.values())
     if options.inputs is None:

@@ -12,14 +12,13 @@ from .common import (
     DONE,
     NOT_CONVERGED,
     Commands,
+    add_cache,
     add_precision,
     check_folders,
     command,
     draw_without_display,
-    reduce_compile_time,
     set_precision,
 )
-from .compiling import add_cache
 
 
 def add_fit(commands: Commands) -> None:
@@ -50,7 +49,6 @@ def _fit(options: argparse.Namespace) -> int:
     from ..calibration.fit_file import load_fit
     from ..calibration.fitting import fit
 
-    reduce_compile_time(optimise=True)
     set_precision(options.precision)
     check_folders(options.out, options.json, options.plot)
     problem = load_fit(options.fit)

@@ -17,7 +17,6 @@ from .common import (
     bounds,
     check_folders,
     command,
-    reduce_compile_time,
     warn,
 )
 from .scene_commands import add_scene, model_between, task_of
@@ -58,7 +57,6 @@ def add_reach(commands: Commands) -> None:
 def _reach(options: argparse.Namespace) -> int:
     from ..analysis.inverse import reach
 
-    reduce_compile_time(optimise=True)
     task = task_of(options)
     check_folders(options.json)
     low, high = bounds(options.low, options.high, 2 * np.asarray(task.inputs))

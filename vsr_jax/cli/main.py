@@ -2,6 +2,7 @@
 targets, reproduces the paper, measures costs."""
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -90,11 +91,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = [_spaced(argument) for argument in (sys.argv[1:] if argv is None else argv)]
     options = _parser(arguments[:1]).parse_args(arguments)
-    from .compiling import compiling
-
+    if getattr(options, "no_cache", False):
+        os.environ["VSR_JAX_CACHE"] = "off"
     try:
-        with compiling(options):
-            return options.run(options)
+        return options.run(options)
     except (ValueError, OSError, ImportError) as error:
         print(f"vsr-jax: {' '.join(str(error).split())}", file=sys.stderr)
         return BAD_USAGE

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
-from ..solution.summary import Summary, values_of
+from ..solution.summary import Summary
 from ..typing import VectorLike
 
 _VALUES = ("tip", "stability", "forces", "lengths", "slack")
@@ -19,13 +19,12 @@ Values = Mapping[str, Any]
 
 
 def values(eq: Equilibrium) -> Values | None:
-    """What `lines` needs, from one compiled program; None for a solve that failed."""
-    return values_of(eq, _VALUES) if bool(eq.converged) else None
+    """What `lines` needs; None for a solve that failed."""
+    return {name: eq.value(name) for name in _VALUES} if bool(eq.converged) else None
 
 
 def summary(eq: Equilibrium, stations: VectorLike) -> Summary | None:
-    """What `record` needs, and with its `values` `lines`, from one compiled program; None for a
-    solve that failed.
+    """What `record` needs, and with its `values` `lines`; None for a solve that failed.
 
     **Arguments:** `eq`: one equilibrium; `stations`: their number, or their abscissas [m].
     """

@@ -25,16 +25,15 @@ from ..solution.step_choice import plan
 from .common import (
     DONE,
     NOT_CONVERGED,
+    add_cache,
     add_precision,
     check_folders,
     command,
     draw_without_display,
     positive_integer,
-    reduce_compile_time,
     set_precision,
     warn,
 )
-from .compiling import add_cache
 
 MODELS = ("strain-dependent", "prescribed", "continuum")
 """Names of the models, the most used first."""
@@ -185,7 +184,6 @@ def model_between(
 
 
 def _solve(options: argparse.Namespace) -> int:
-    reduce_compile_time(optimise=False)
     scene, inputs, model, title = task_of(options)
     check_folders(options.plot, options.json)
     eq = solve(scene, inputs, model=model, tolerance=options.tolerance)
@@ -195,7 +193,6 @@ def _solve(options: argparse.Namespace) -> int:
 
 
 def _check(options: argparse.Namespace) -> int:
-    reduce_compile_time(optimise=True)
     scene, inputs, model, title = task_of(options)
     check_folders(options.json)
     model = (

@@ -13,7 +13,6 @@ from .common import (
     add_bounds,
     bounds,
     command,
-    reduce_compile_time,
 )
 from .scene_commands import add_scene, task_of
 
@@ -58,15 +57,12 @@ def add_view(commands: Commands) -> None:
         help="port, or the next free one (default: %(default)s)",
     )
     parser.add_argument("--no-browser", action="store_true", help="do not open the page")
-    # the page says itself that it compiles
-    parser.set_defaults(progress_bar=True)
 
 
 def _view(options: argparse.Namespace) -> int:
     from ..viewer.page import view, viewer_library
 
     viewer_library()
-    reduce_compile_time(optimise=True)
     numbers = numbers_of(options.number)
     task = task_of(options)
     model = task.model

@@ -1,6 +1,5 @@
 """Round channels across the threads at rest, cut by the planes of the sections."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +8,7 @@ from jaxtyping import Array, Float
 from ..arm.actuator import Actuator
 from ..arm.routing import thread_tangent
 from ..arm.scene import Scene
+from ..numerics.compiling import program
 from ..typing import Scalar
 from .stations import Stations, in_blocks, polygon_size
 
@@ -36,7 +36,7 @@ def channel_rings(
     return list(rings), np.stack(off, axis=1) if off else np.zeros((stations.X.size, 0))
 
 
-@eqx.filter_jit
+@program("export")
 def _rings(
     scene: Scene, X: Array, radii: list[Array], around: list[Array]
 ) -> list[tuple[Array, Array]]:

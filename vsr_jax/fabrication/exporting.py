@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..arm.scene import Scene
+from ..numerics.compiling import program
 from ..numerics.component import norm
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
@@ -248,7 +249,7 @@ def _warnings(stations: Stations, found: Sequence[Wall], least: float) -> list[s
     return thin
 
 
-@eqx.filter_jit
+@program("export")
 def _rest_lengths(scene: Scene) -> Float[Array, " threads"]:
     lengths = [scene.rest_length(i) for i in range(len(scene.actuators))]
     return jnp.array(lengths, scene.rod.length.dtype)
@@ -263,7 +264,7 @@ def _rest_arc(scene: Scene, X: np.ndarray) -> np.ndarray:
     return np.concatenate(([0.0], np.cumsum(steps)))
 
 
-@eqx.filter_jit
+@program("export")
 def _rest_stretch(scene: Scene, X: Float[Array, " places"]) -> Float[Array, " places"]:
     """Length of the axis per X at rest."""
     return norm(scene.sections(X).rest[3:])

@@ -7,7 +7,6 @@ A breakpoint has two stations, one on each side, because sizes may jump there.
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..arm.routing import thread_tangent
 from ..arm.scene import Scene
+from ..numerics.compiling import program
 from ..solution.equilibrium import Equilibrium
 from ..typing import DTypeLike
 
@@ -224,7 +224,7 @@ def in_blocks(function: Callable[[Array], Any], X: np.ndarray) -> Any:
     return jax.tree.map(lambda *parts: np.concatenate(parts)[: X.size], *blocks)
 
 
-@eqx.filter_jit
+@program("export")
 def _sections(scene: Scene, X: Array, angle: Array) -> tuple[Array, Array, Array, Array]:
     rod, sections = scene.rod, scene.sections(X)
     outline = jax.vmap(

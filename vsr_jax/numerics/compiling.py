@@ -1,51 +1,188 @@
-"""The device that programs are compiled for, and programs that take longer to trace and compile
-than to run."""
+"""Programs that the package compiles where it is called outside of JAX's transformations.
+
+XLA takes seconds to optimize a solve that then runs in less than a millisecond. Without
+optimizations it takes a third of that, and the program runs for some milliseconds. So a program is
+compiled quickly at first; one that has run for `LONG` is compiled again in the background, and
+replaced when that is ready. Both are kept on disk, see `program_store`.
+"""
 
 import gc
 import os
-from collections.abc import Callable, Iterator
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import cache, wraps
-from typing import Any, TypeVar, cast
+from contextvars import ContextVar
+from functools import partial, update_wrapper
+from typing import Any
+from weakref import WeakSet
 
 import equinox as eqx
 import jax
 from jax.core import Tracer
+from jaxtyping import Array
 
-_NESTED = "`compiler_options` can only be passed to top-level"
-"""What JAX says of compiler options under a transformation."""
+from . import program_store
 
-F = TypeVar("F", bound=Callable)
+VARIABLE = "VSR_JAX_TIERS"
+"""Environment variable; "off" compiles every program once, with XLA's defaults."""
+
+LONG = 2.0
+"""Seconds that a quick program runs before it is compiled again."""
+
+SILENT = 3.0
+"""Seconds of compiling after which a message appears."""
+
+_LEVEL = "xla_backend_optimization_level"
+
+_SETTINGS = (
+    "jax_enable_x64",
+    "jax_default_device",
+    "jax_default_matmul_precision",
+    "jax_numpy_dtype_promotion",
+    "jax_disable_jit",
+    "jax_debug_nans",
+    "jax_debug_infs",
+)
+"""Settings of JAX that a traced program depends on."""
+
+_shown: ContextVar[bool] = ContextVar("shown", default=True)
+_programs: WeakSet["Program"] = WeakSet()
 
 
-def quick_jit(function: F) -> F:
-    """`equinox.filter_jit`, with `quick_compilation` where nothing is traced: JAX takes compiler
-    options outside of its transformations only, and batches are traced by `jax.vmap`. `lower` has
-    the options too. Nothing looks for garbage meanwhile."""
-    plain = eqx.filter_jit(function)
+def program(name: str) -> Callable[[Callable], "Program"]:
+    """Decorator that makes a function of pytrees a `Program`; `name` is what messages call it."""
+    return lambda function: Program(function, name)
 
-    @cache
-    def quick() -> Callable:
-        options: dict[str, Any] = {"compiler_options": quick_compilation()}
-        return eqx.filter_jit(function, **options)
 
-    @wraps(function)
-    @garbage_kept()
-    def call(*args: Any, **kwargs: Any) -> Any:
-        leaves = jax.tree.leaves((args, kwargs))
-        if not any(isinstance(leaf, Tracer) for leaf in leaves):
-            try:
-                return quick()(*args, **kwargs)
-            except ValueError as error:  # known arguments in a function that `jax.jit` traces
-                if _NESTED not in str(error):
-                    raise
-        return plain(*args, **kwargs)
+class Program:
+    """A compiled function of pytrees, in which everything that is not an array is static.
 
-    def lower(*args: Any, **kwargs: Any) -> Any:
-        return quick().lower(*args, **kwargs)  # pyright: ignore[reportFunctionMemberAccess]
+    Under a transformation of JAX, on other devices than a CPU, and where JAX is set to debug, it is
+    `equinox.filter_jit(function)`.
+    """
 
-    call.lower = lower  # pyright: ignore[reportAttributeAccessIssue]
-    return cast(F, call)
+    def __init__(self, function: Callable, name: str):
+        update_wrapper(self, function)
+        self._function, self._name = function, name
+        self._traced = eqx.filter_jit(function)
+        self._kinds: dict[Hashable, _Kind | None] = {}
+        _programs.add(self)
+
+    def __get__(self, instance: Any, owner: Any = None) -> Callable:
+        return self if instance is None else partial(self, instance)
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        kind, arrays = self._kind(args, kwargs)
+        return self._traced(*args, **kwargs) if kind is None else kind(arrays)
+
+    def compile(self, *args: Any, **kwargs: Any) -> None:
+        """Compiles the program for such arguments, without running it."""
+        self._kind(args, kwargs)
+
+    def _kind(self, args: tuple, kwargs: dict) -> tuple["_Kind | None", list[Array]]:
+        """The program for arguments of this kind, and their arrays; None where JAX compiles it."""
+        leaves, structure = jax.tree.flatten((args, kwargs))
+        arrays = [x for x in leaves if isinstance(x, jax.Array)]
+        if any(isinstance(x, Tracer) for x in arrays):
+            return None, arrays
+        static = tuple([None if isinstance(x, jax.Array) else (type(x), x) for x in leaves])
+        kinds = tuple([(x.aval, x.sharding) for x in arrays])
+        settings = tuple([getattr(jax.config, setting) for setting in _SETTINGS])
+        key = structure, static, kinds, settings
+        if key not in self._kinds:
+            self._kinds[key] = (
+                self._compiled(structure, static, arrays) if _on_host(arrays) else None
+            )
+        return self._kinds[key], arrays
+
+    def _compiled(self, structure: Any, static: tuple, arrays: list[Array]) -> "_Kind":
+        text = f"vsr_jax: compiling {self._name}"
+        with message_when_slow(text), garbage_kept():
+            return _Kind(self._function, structure, static, arrays)
+
+
+class _Kind:
+    """A program for one kind of arguments: their structure, and their static leaves, with None in
+    place of arrays."""
+
+    def __init__(self, function: Callable, structure: Any, static: tuple, arrays: list[Array]):
+        self._ran, self._improving = 0.0, False
+        self._structure: Any = None
+        self._static: list[tuple | None] = []
+
+        def run(arrays: list[Array]) -> list[Array]:
+            args, kwargs = jax.tree.unflatten(structure, _filled(static, arrays))
+            leaves, self._structure = jax.tree.flatten(function(*args, **kwargs))
+            self._static = [None if eqx.is_array(x) else (x,) for x in leaves]
+            return [x for x in leaves if eqx.is_array(x)]
+
+        lowered, quick = jax.jit(run).lower(arrays), _quick_options()
+        best = program_store.stored(lowered, {}) if quick else None
+        self._run = best or program_store.compiled(lowered, quick)
+        self._lowered = lowered if quick and best is None else None
+
+    def __call__(self, arrays: list[Array]) -> Any:
+        if self._lowered is None:
+            found = self._run(arrays)
+        else:
+            begin = time.perf_counter()
+            found = jax.block_until_ready(self._run(arrays))
+            self._ran += time.perf_counter() - begin
+            if self._ran > LONG and not self._improving:
+                self._improving = True
+                _improver.add(self)
+        return jax.tree.unflatten(self._structure, _filled(self._static, found))
+
+    def improve(self) -> None:
+        """Compiles the program with all optimizations, and runs that from now on."""
+        if self._lowered is not None:
+            self._run = program_store.compiled(self._lowered, {})
+            self._lowered = None
+
+
+def _filled(static: Sequence[tuple | None], arrays: list[Array]) -> list:
+    """Leaves, with the arrays in place of None."""
+    rest = iter(arrays)
+    return [next(rest) if x is None else x[-1] for x in static]
+
+
+class _Improver:
+    """A thread that improves programs one after another, and ends when there are none. At the end
+    of the process it is waited for, since XLA cannot be interrupted, for one program only."""
+
+    def __init__(self):
+        self._waiting: deque[_Kind] = deque()
+        self._lock = threading.Lock()
+        self._running = False
+
+    def add(self, kind: _Kind) -> None:
+        """Improves a program when those before it are done."""
+        with self._lock:
+            self._waiting.append(kind)
+            if not self._running:
+                self._running = True
+                threading.Thread(target=self._work, name="vsr_jax compiler").start()
+
+    def _work(self) -> None:
+        while True:
+            with self._lock:
+                if not self._waiting or not threading.main_thread().is_alive():
+                    self._running = False
+                    return
+                kind = self._waiting.popleft()
+            kind.improve()
+
+
+_improver = _Improver()
+
+
+def drop_programs() -> None:
+    """Drops all compiled programs of the package, as `jax.clear_caches` those of JAX."""
+    for one in _programs:
+        one._kinds.clear()
 
 
 @contextmanager
@@ -61,6 +198,29 @@ def garbage_kept() -> Iterator[None]:
             gc.enable()
 
 
+@contextmanager
+def message_when_slow(text: str) -> Iterator[None]:
+    """Context that prints `text` to stderr if it is still open after `SILENT` seconds."""
+    timer = threading.Timer(SILENT, print, [text], {"file": sys.stderr, "flush": True})
+    timer.daemon = True
+    if _shown.get():
+        timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+@contextmanager
+def messages(shown: bool) -> Iterator[None]:
+    """Context with or without messages of programs that compile."""
+    token = _shown.set(shown and _shown.get())
+    try:
+        yield
+    finally:
+        _shown.reset(token)
+
+
 def on_cpu() -> bool:
     """Whether programs that are traced now run on a CPU."""
     device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
@@ -69,33 +229,34 @@ def on_cpu() -> bool:
 
 
 def quick_compilation() -> dict[str, bool | int]:
-    """Compiler options with which large programs compile in half to two thirds of the time on CPU:
+    """Compiler options with which large programs compile in a third of the time on CPU:
     `jax.jit(function, compiler_options=vsr.quick_compilation())`.
 
-    XLA's older code generation for fused operations, and its second level of optimization in place
-    of the third, unless `XLA_FLAGS` names one. `solve` and all else that is not a large batch use
-    them already where they are called outside of JAX's transformations; JAX takes them at the
-    outermost `jax.jit` only, so that they are yours to give where `jax.grad` or `jax.jit` is.
+    Without XLA's optimizations one arm takes 5 to 10 times as long to solve: some milliseconds. So
+    they are for programs that run hundreds of times, not for batches and not for many thousand
+    calls. `solve` and all else that the package compiles itself begins with them.
 
-    One arm is solved as fast with them, and differentiated too; with contact it takes a tenth
-    longer, and a large batch of arms without loads a fifth.
-
-    **Returns:** the options; none on other devices than CPUs, or where XLA does not know them.
+    **Returns:** the options; none on other devices than CPUs, and none where `XLA_FLAGS` names an
+    optimization level.
     """
-    if not on_cpu():
+    if not on_cpu() or _LEVEL in os.environ.get("XLA_FLAGS", ""):
         return {}
-    options: dict[str, bool | int] = {"xla_cpu_use_fusion_emitters": False}
-    level = "xla_backend_optimization_level"
-    if level not in os.environ.get("XLA_FLAGS", ""):
-        options[level] = 2
-    return options if _known(tuple(options.items())) else {}
+    return {_LEVEL: 0, "xla_llvm_disable_expensive_passes": True}
 
 
-@cache
-def _known(options: tuple[tuple[str, bool | int], ...]) -> bool:
-    """Whether XLA knows compiler options."""
-    try:
-        jax.jit(lambda x: x, compiler_options=dict(options)).lower(0.0).compile()
-    except (RuntimeError, ValueError):
+def _quick_options() -> dict[str, bool | int]:
+    """`quick_compilation`, unless `VSR_JAX_TIERS` is "off"."""
+    return {} if os.environ.get(VARIABLE) == "off" else quick_compilation()
+
+
+def _on_host(arrays: list[Array]) -> bool:
+    """Whether a program for the arrays runs on the first CPU of this process, and JAX does not
+    debug."""
+    config: Any = jax.config
+    if not on_cpu() or config.jax_disable_jit or config.jax_debug_nans or config.jax_debug_infs:
         return False
-    return True
+    host = jax.local_devices(backend="cpu")[0]
+    chosen = config.jax_default_device
+    return (chosen is None or isinstance(chosen, str) or chosen == host) and all(
+        x.sharding.device_set == {host} for x in arrays
+    )

@@ -9,7 +9,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jax.extend.core import Literal
 
 
 def fingerprint(function: Callable, arguments: Any, *more: Any) -> str:
@@ -23,12 +23,12 @@ def fingerprint(function: Callable, arguments: Any, *more: Any) -> str:
 
     program = jax.make_jaxpr(run)(arrays)
     parts = list(nested(program))
-    constants = [part.consts for part in parts]
+    constants = [getattr(part, "consts", ()) for part in parts]
     # an array among them is printed by its shape only
     literals = [
         atom.val
         for part in parts
-        for equation in part.jaxpr.eqns
+        for equation in part.eqns
         for atom in equation.invars
         if isinstance(atom, Literal)
     ]
@@ -38,16 +38,18 @@ def fingerprint(function: Callable, arguments: Any, *more: Any) -> str:
     return digest.hexdigest()
 
 
-def nested(program: ClosedJaxpr) -> Iterator[ClosedJaxpr]:
-    """A program and all programs that it calls, the body of a loop once, each with its own
-    constants."""
+def nested(program: Any) -> Iterator[Any]:
+    """A program and all programs that it calls, the body of a loop once.
+
+    A program is whatever has `eqns`: JAX had one class for programs with constants of their own,
+    `consts`, and one for others, and has a single class since 0.12.
+    """
     yield program
-    for equation in program.jaxpr.eqns:
-        for leaf in jax.tree.leaves(
-            list(equation.params.values()), is_leaf=lambda x: isinstance(x, ClosedJaxpr | Jaxpr)
-        ):
-            # since JAX 0.12 both are one class, and a program keeps its own constants
-            if isinstance(leaf, ClosedJaxpr):
+    for equation in program.eqns:
+        for leaf in jax.tree.leaves(list(equation.params.values()), is_leaf=_is_program):
+            if _is_program(leaf):
                 yield from nested(leaf)
-            elif isinstance(leaf, Jaxpr):
-                yield from nested(ClosedJaxpr(leaf, ()))
+
+
+def _is_program(x: Any) -> bool:
+    return hasattr(x, "eqns")

@@ -18,7 +18,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, PyTree
 
-from ..numerics.compiling import quick_jit
+from ..numerics.compiling import program
 from ..typing import Scalar
 from . import bounded
 
@@ -151,7 +151,7 @@ def begin(
     return DescentState(best.z, best.z, jax.vmap(optimizer.init)(best.z), worst._replace(z=best.z))
 
 
-@quick_jit
+@program("design")
 def descend(
     problem: DesignProblem,
     optimizer: optax.GradientTransformationExtraArgs,

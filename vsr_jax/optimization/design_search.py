@@ -25,6 +25,7 @@ from ..analysis.constraint import Constraint
 from ..arm.scene import Scene
 from ..arm.scene_numbers import parameters
 from ..models.base import Model
+from ..numerics.compiling import messages
 from ..typing import Scalar
 from ..validation import instance, is_traced
 from .checkpoint import Checkpoint
@@ -179,7 +180,8 @@ def design(
     instance("search", search, Search, "a Search")
     rule, settings = search.update_rule, (search.starts, search.candidates, search.seed)
     checkpoint = Checkpoint(out, problem, rule, (*settings, search.steps))
-    with tqdm(total=search.steps, unit=" steps", disable=not progress, desc="compiling") as bar:
+    bar = tqdm(total=search.steps, unit=" steps", disable=not progress, desc="compiling")
+    with bar, messages(False):
         states = begin(problem, rule, given, *settings)
         states, history = _run(problem, rule, search, checkpoint, states, bar)
     return _result(problem, terms, states, history)

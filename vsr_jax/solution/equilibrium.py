@@ -16,7 +16,7 @@ from ..mechanics.coupling import ArmProblem
 from ..mechanics.reaction import react_at
 from ..models.base import Model, Nodes, Outcome, Status
 from ..numerics import component as c
-from ..numerics.compiling import quick_jit
+from ..numerics.compiling import program
 from ..numerics.component import Vector
 from ..typing import Pose, Scalar, VectorLike
 from ..validation import is_traced, on_arm
@@ -32,17 +32,17 @@ from .quantities import (
     structure,
 )
 from .stability import extreme, extreme_supported
-from .summary import Summary, summary_of, values_of
+from .summary import Summary, summary_of
 
 
 class Equilibrium(Solved):
     """A solved scene.
 
     Each quantity is computed on demand by its own compiled program: a program that only needs the
-    tip computes only the tip. `summary` computes many quantities in one program. Where the solve
-    failed, every quantity is NaN and `status` gives the reason. A quantity at abscissas X [m] takes
-    a scalar or a 1-D array with values from 0 to the arm's length. It raises `ValueError` for an X
-    beyond the arm if both are concrete, and is NaN there under `jax.jit`.
+    tip computes only the tip. Where the solve failed, every quantity is NaN and `status` gives the
+    reason. A quantity at abscissas X [m] takes a scalar or a 1-D array with values from 0 to the
+    arm's length. It raises `ValueError` for an X beyond the arm if both are concrete, and is NaN
+    there under `jax.jit`.
 
     **Fields:** `scene`, `inputs` [units of the actuators], `model`; `status`, a `Status` as an
     integer; `steps`, the number of Newton steps (integration steps for `Continuum`); `state`, the
@@ -76,7 +76,7 @@ class Equilibrium(Solved):
         return f"  status     {self.message} ({method})", f"  effects    {effects}"
 
     def summary(self, X: VectorLike = 61, values: Sequence[str] = ()) -> Summary:
-        """All quantities along the arm, and selected other ones, from one compiled program.
+        """All quantities along the arm, from one compiled program, and selected other ones.
 
         **Arguments:** `X`: number of stations, evenly spaced on the arm, or their abscissas [m];
         `values`: names of quantities that are not functions of X, as in `("tip", "stability")`.
@@ -254,15 +254,14 @@ class Equilibrium(Solved):
     def __str__(self) -> str:
         if is_traced(self.status) or jnp.ndim(self.status) > 0 or not bool(self.converged):
             return repr(self)
-        values = values_of(self, ("tip", "stability", "error"))
-        tip, error = values["tip"], values["error"].tip
+        tip, error = self.tip, self.error.tip
         return "\n".join(
             (
                 f"Equilibrium: converged in {int(self.steps)} steps",
                 f"  model            {self.model!r}, {self.inputs.dtype}",
                 f"  tip              ({', '.join(f'{float(x):.6g}' for x in tip[:3, 3])}) m",
                 f"  estimated error  {float(error):.1e} m",
-                f"  stability margin {float(values['stability']):.3g}",
+                f"  stability margin {float(self.stability):.3g}",
             )
         )
 
@@ -291,7 +290,7 @@ class Equilibrium(Solved):
         start, end = actuator.start, actuator.end
         return 0.0 if start is None else start, self.scene.rod.length if end is None else end
 
-    @quick_jit
+    @program("thread")
     def _thread(self, index: int, X: Array) -> Array:
         actuator = self.scene.actuators[index]
 

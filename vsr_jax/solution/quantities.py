@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..arm.scene import Scene
 from ..models.base import Status
-from ..numerics.compiling import quick_jit
+from ..numerics.compiling import Program
 from ..numerics.quadrature import onto
 from ..typing import VectorLike
 from ..validation import ROUNDING, choice, on_arm
@@ -88,7 +88,7 @@ class Quantity(_Entry, Generic[T]):
     def __init__(self, compute: Callable[..., T], unit: str, dims: tuple[str, ...] | None):
         super().__init__(compute, unit)
         self.dims = dims
-        self._program = quick_jit(self._masked)
+        self._program = Program(self._masked, self.name)
 
     def _masked(self, eq: Solved) -> T:
         return eq.masked(self.compute(eq))
@@ -118,7 +118,7 @@ class AlongArm(_Entry):
     ):
         super().__init__(compute, unit)
         self.dims, self.of = dims, of
-        self._program = quick_jit(self.at)
+        self._program = Program(self.at, self.name)
 
     def at(self, eq: Solved, X: Array) -> Array:
         """The value at abscissas that are checked."""

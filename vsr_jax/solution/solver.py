@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 from ..arm.scene import Scene
 from ..models.base import Model, Near, Outcome, Status, resolved
 from ..models.strain_dependent import StrainDependent
-from ..numerics.compiling import quick_jit
+from ..numerics.compiling import program
 from ..typing import VectorLike, cast
 from ..validation import instance, is_traced, positive
 from .equilibrium import Equilibrium
@@ -116,7 +116,7 @@ def _named(scene: Scene) -> str:
     return f"the actuators {', '.join(names)}" if names else "no actuators"
 
 
-@quick_jit
+@program("solve")
 def outcome_of(
     scene: Scene, inputs: Float[Array, " inputs"], model: Model, near: Near | None = None
 ) -> Outcome:

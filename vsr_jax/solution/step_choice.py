@@ -21,7 +21,7 @@ from ..arm.scene import Scene
 from ..mechanics.balance import forces_where
 from ..models.base import Status, resolved
 from ..models.strain_dependent import StrainDependent
-from ..numerics.compiling import quick_jit
+from ..numerics.compiling import program
 from ..numerics.quadrature import Grid, make_grid
 from ..typing import VectorLike, cast
 from ..validation import instance, interval, is_traced, positive
@@ -234,7 +234,7 @@ def _rounding(scene: Scene, samples: Array, model: StrainDependent) -> float:
     return float(np.max(np.nan_to_num(np.linalg.norm(rounded - tips, axis=1)[solved], nan=np.inf)))
 
 
-@quick_jit
+@program("plan")
 def _tips(scene: Scene, samples: Array, model: StrainDependent) -> Array:
     return jax.vmap(lambda inputs: _tip_of(scene, inputs, model)[0])(samples)
 
@@ -261,7 +261,7 @@ def _tip_of(scene: Scene, inputs: Array, model: StrainDependent) -> tuple[Array,
     return jnp.where(sound, tip, jnp.nan), resolved(model, scene, outcome).status
 
 
-@quick_jit
+@program("plan")
 def _tip_errors(scene: Scene, samples: Array, steps: Array, capacity: int) -> tuple[Array, Array]:
     """Distance [m] of the tip from the reference, the solve with the last number of steps, for each
     sample and each other number; and the status of the reference."""
@@ -275,7 +275,7 @@ def _tip_errors(scene: Scene, samples: Array, steps: Array, capacity: int) -> tu
     return lax.map(of, samples)
 
 
-@quick_jit
+@program("plan")
 def _gradient_errors(scene: Scene, samples: Array, steps: Array, capacity: int) -> Array:
     """Largest relative error of a derivative, for each sample and each number of steps except the
     last, the reference."""

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..arm.discs import on_chords, points_at
-from ..numerics.compiling import quick_jit
+from ..numerics.compiling import program
 from ..typing import VectorLike
 from ..validation import choice
 from .quantities import QUANTITIES, AlongArm, Quantity, Solved, abscissas
@@ -49,22 +49,11 @@ class Summary(eqx.Module):
 
 def summary_of(eq: Solved, X: VectorLike = 61, values: Sequence[str] = ()) -> Summary:
     """`Equilibrium.summary`."""
-    return _summary(eq, stations(eq, X), _checked(values))
-
-
-def values_of(eq: Solved, names: Sequence[str]) -> dict[str, Any]:
-    """Quantities that are not functions of X by name, from one compiled program; a `Summary` has
-    the same as its `values`.
-
-    **Raises:** `ValueError` for a batch of equilibria, and a name that the table does not have.
-    """
-    eq.refuse_batch()
-    return _values(eq, _checked(names))
-
-
-def _checked(names: Sequence[str]) -> tuple[str, ...]:
     known = [name for name, entry in QUANTITIES.items() if isinstance(entry, Quantity)]
-    return tuple(choice("values", name, known) for name in names)
+    names = [choice("values", name, known) for name in values]
+    at = stations(eq, X)
+    along, threads, wall = _along(eq, at)
+    return Summary(at, along, threads, wall, {name: eq.value(name) for name in names})
 
 
 def stations(eq: Solved, X: VectorLike, name: str = "X") -> Float[Array, " stations"]:
@@ -78,20 +67,15 @@ def stations(eq: Solved, X: VectorLike, name: str = "X") -> Float[Array, " stati
 
 
 def compiled_summary(eq: Solved, X: VectorLike) -> Callable[[Solved], Summary]:
-    """The program of `summary_of` at given stations, compiled but not run: for this equilibrium and
-    all others of the same model and kind of scene."""
-    at = stations(eq, X)
-    program = _summary.lower(eq, at, ()).compile()  # pyright: ignore[reportFunctionMemberAccess]
-    return lambda eq: program(eq, at, ())
+    """`summary_of` at given stations, compiled but not run: for this equilibrium and all others of
+    the same model and kind of scene."""
+    _along.compile(eq, stations(eq, X))
+    return lambda eq: summary_of(eq, X)
 
 
-@quick_jit
-def _values(eq: Solved, names: tuple[str, ...]) -> dict[str, Any]:
-    return {name: eq.value(name) for name in names}
-
-
-@quick_jit
-def _summary(eq: Solved, X: Array, names: tuple[str, ...]) -> Summary:
+@program("summary")
+def _along(eq: Solved, X: Array) -> tuple[dict[str, Array], Array, Array]:
+    """Every quantity along the arm, the threads and the wall."""
     along: dict[str, Array] = {}
     for name, entry in QUANTITIES.items():  # an entry `of` another comes after it
         if isinstance(entry, AlongArm):
@@ -109,7 +93,7 @@ def _summary(eq: Solved, X: Array, names: tuple[str, ...]) -> Summary:
     lines = jnp.swapaxes(carried[0], 0, 1)
     for i in eq.scene.straight:
         lines = lines.at[i].set(jnp.where(jnp.isnan(lines[i]), jnp.nan, _chords(eq, i, X)))
-    return Summary(X, along, lines, carried[1], _values(eq, names))
+    return along, lines, carried[1]
 
 
 def _chords(eq: Solved, place: int, X: Array) -> Array:

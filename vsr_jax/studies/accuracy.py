@@ -19,7 +19,7 @@ from ..models.basis import AbstractBasis, Basis, Legendre, PiecewiseConstant
 from ..models.continuum import Continuum
 from ..models.prescribed import Prescribed
 from ..models.strain_dependent import StrainDependent
-from ..numerics.compiling import on_cpu
+from ..numerics.compiling import quick_compilation
 from ..solution.solver import solve
 from ..solution.step_choice import gradient_error
 from ..typing import cast
@@ -39,8 +39,6 @@ STATIONS, FEW = 41, 8
 
 _SINGLES = 5
 """Single solves per round: one alone is close to the resolution of the clock."""
-_QUICK = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
-"""Compiler options for programs that are not timed."""
 
 
 class Setting(NamedTuple):
@@ -155,9 +153,8 @@ def _shape_program(scene: Scene, inputs: Array, model: Model) -> _ShapeProgram:
             jnp.concatenate([leaf.reshape(3, -1) for leaf in slopes], axis=1),
         )
 
-    options = _QUICK if on_cpu() and jax.__version_info__ < (0, 11) else None
     return _ShapeProgram(
-        jax.jit(jax.vmap(of)).lower(inputs).compile(compiler_options=options), inputs
+        jax.jit(jax.vmap(of)).lower(inputs).compile(compiler_options=quick_compilation()), inputs
     )
 
 

@@ -6,21 +6,19 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable
 from functools import cached_property
+from typing import Any
 
 import jax
 import numpy as np
-from jax.extend.core import ClosedJaxpr
 from jaxtyping import PyTree
 
 from ..numerics.fingerprint import nested
 
 
-def primitives(program: ClosedJaxpr) -> Counter[str]:
+def primitives(program: Any) -> Counter[str]:
     """How often each primitive occurs in a program and in all that it calls, the body of a loop
     counted once; their total is a size of the program that does not depend on the machine."""
-    return Counter(
-        equation.primitive.name for part in nested(program) for equation in part.jaxpr.eqns
-    )
+    return Counter(equation.primitive.name for part in nested(program) for equation in part.eqns)
 
 
 class Timed:

@@ -12,13 +12,13 @@ $\sqrt{(E \epsilon)^2 + 3 G^2 (\gamma_y^2 + \gamma_z^2)}$.
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from ..arm.rod import Rod
+from ..numerics.compiling import program
 from ..solution.equilibrium import Equilibrium
 from ..solution.summary import Summary
 from ..viz.annotate import Acting, Row, rows_from_wrenches, wrenches_of
@@ -61,7 +61,7 @@ def shape_of(eq: Equilibrium) -> Shape:
     )
 
 
-@eqx.filter_jit
+@program("view")
 def _described(eq: Equilibrium) -> tuple[Summary, Array, Array, list[Acting]]:
     X = with_rigid_ends(eq.scene.rod, jnp.linspace(0, 1, STATIONS) * eq.scene.rod.length)
     samples = eq.summary(X, ("forces", "stability"))

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from functools import singledispatch
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +14,7 @@ from mpl_toolkits.mplot3d.axes3d import Axes3D
 
 from ..arm.obstacles import Box, Cylinder, Obstacle, Plane, Sphere
 from ..arm.tube import Tube, curve_through
+from ..numerics.compiling import program
 from ..typing import Scalar
 from .style import COLORS, ink, mixed
 
@@ -117,12 +117,12 @@ def _surface(obstacle: Obstacle, region: Region) -> Polygons:
     return list(np.asarray(corners, float).reshape(-1, 4, 3))
 
 
-@eqx.filter_jit
+@program("plot")
 def _distances(obstacle: Obstacle, points: Array) -> Array:
     return jax.vmap(obstacle.distance)(points)
 
 
-@eqx.filter_jit
+@program("plot")
 def _projected(obstacle: Obstacle, points: Array, step: Scalar) -> Array:
     """Points moved to the surface along its normal, at most by a step [m] at a time."""
 
