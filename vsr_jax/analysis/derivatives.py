@@ -16,11 +16,11 @@ from ..arm.loads import TipWrench
 from ..arm.scene import Scene
 from ..arm.scene_numbers import parameters, replaced
 from ..mechanics.balance import free_block, tangent
+from ..models.base import Near
 from ..numerics import component as c
 from ..numerics.compiling import program
 from ..numerics.se3 import skew, unskew
 from ..solution.equilibrium import Equilibrium
-from ..solution.solver import solve
 from ..typing import Pose
 
 
@@ -94,7 +94,7 @@ def _by_numbers(eq: Equilibrium) -> tuple[Array, Array, Array]:
 
     def motion(numbers: dict[str, Array], inputs: Array) -> Array:
         scene = replaced(eq.scene, numbers)
-        return _motion(solve(scene, inputs, model=eq.model, start=_near(eq)).tip, eq.tip)
+        return _motion(_moved(eq, scene, inputs).tip, eq.tip)
 
     by_numbers, by_inputs = jax.jacrev(motion, argnums=(0, 1))(numbers, eq.inputs)
     rows = jnp.concatenate(
@@ -124,8 +124,7 @@ def tip_jacobian(eq: Equilibrium) -> Float[Array, "6 inputs"]:
 @program("tip_jacobian")
 def _by_inputs(eq: Equilibrium) -> Array:
     def motion(inputs: Array) -> Array:
-        found = solve(eq.scene, inputs, model=eq.model, start=_near(eq))
-        return _motion(found.tip, eq.tip)
+        return _motion(_moved(eq, eq.scene, inputs).tip, eq.tip)
 
     return eq.masked(jax.jacfwd(motion)(eq.inputs))
 
@@ -171,12 +170,14 @@ def _pushed(eq: Equilibrium, wrench: Float[Array, "6"]) -> Equilibrium:
     old = eq.scene
     around = {"held": old.held, "obstacles": old.obstacles}
     scene = Scene(old.rod, old.actuators, loads, free_strains=old.free_strains, **around)
-    return solve(scene, eq.inputs, model=eq.model, start=_near(eq))
+    return _moved(eq, scene, eq.inputs)
 
 
-def _near(eq: Equilibrium) -> Equilibrium | None:
-    """Where a solve near by starts: an arm that is held or touches may have several equilibria."""
-    return eq if eq.scene.held or eq.scene.obstacles else None
+def _moved(eq: Equilibrium, scene: Scene, inputs: Array) -> Equilibrium:
+    """The equilibrium as a function of the numbers of its scene and of its inputs, to be
+    differentiated: it is not solved again."""
+    near = Near(eq.model, eq.scene, eq.sound_forces, eq.state)
+    return Equilibrium(scene, inputs, eq.model, eq.model.solve_at(scene, inputs, near))
 
 
 def _carried(g: Pose, tip: Pose) -> Float[Array, "6 6"]:

@@ -55,9 +55,16 @@ _START_STEPS = 4
 """Fixed-point steps to the start: each gains a factor of the strains that threads cause."""
 
 
-def solve_arm(problem: ArmProblem, free: tuple[int, ...], guess: ArmUnknown | None = None) -> Root:
+def solve_arm(
+    problem: ArmProblem,
+    free: tuple[int, ...],
+    guess: ArmUnknown | None = None,
+    *,
+    solved: bool = False,
+) -> Root:
     """Equilibrium of the arm; its point is an `ArmUnknown`. Newton's method starts from a guess, if
-    one is given, else or where that fails from the balance without loads and couplings.
+    one is given, else or where that fails from the balance without loads and couplings. With
+    `solved` the guess is the equilibrium, of which only derivatives are wanted.
 
     Where only a loosened problem was solved, it is that of `problem.loosened`.
 
@@ -68,6 +75,10 @@ def solve_arm(problem: ArmProblem, free: tuple[int, ...], guess: ArmUnknown | No
     def find(problem: ArmProblem, guess: ArmUnknown | None) -> Root:
         if guess is not None:  # the iteration does not change the locked strains
             guess = guess._replace(xi=with_locked(guess.xi, problem.sections, free))
+        if guess is not None and solved:
+            yes = jnp.array(True)
+            found = guess._replace(xi=free_components(guess.xi, free))
+            return Root(found, yes, yes, jnp.array(0, jnp.int32))
         together = _QUEUED if _uneven(problem) else TOGETHER
         root = side_by_side(partial(_solve, free), together)(_start(problem, free), guess, problem)
         return root._replace(x=root.x._replace(xi=free_components(root.x.xi, free)))

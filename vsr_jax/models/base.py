@@ -123,6 +123,11 @@ class Model(eqx.Module):
         """As `solve`, started from a solution near by; a model without a use for it ignores it."""
         return self.solve(scene, inputs)
 
+    def solve_at(self, scene: Scene, inputs: Float[Array, " inputs"], near: Near) -> Outcome:
+        """As `solve_from`, at a solution of the scene itself, whose derivatives are wanted: a model
+        that can does not solve it again."""
+        return self.solve_from(scene, inputs, near)
+
     @abstractmethod
     def strain(
         self, scene: Scene, forces: Forces, state: Any, X: Float[Array, " stations"]

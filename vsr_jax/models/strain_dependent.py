@@ -89,6 +89,14 @@ class StrainDependent(SteppedModel):
             problem = problem.as_loose_as(lax.stop_gradient(near.state.couplings))
         return self._solve_together(scene, problem, lax.stop_gradient(guess))
 
+    def solve_at(self, scene: Scene, inputs: Float[Array, " inputs"], near: Near) -> Outcome:
+        if not scene.coupled:
+            return self.solve(scene, inputs)
+        state, grid = lax.stop_gradient(near.state), self.grid(scene)
+        problem = self.problem_on(scene, inputs, state, grid).as_loose_as(state.couplings)
+        solution = ArmUnknown(state.xi, state.coupled)
+        return self._solve_together(scene, problem, solution, solved=True)
+
     def solve_after(self, scene: Scene, inputs: Float[Array, " inputs"], near: Near) -> Outcome:
         """As `solve_from`, on a path of inputs: the couplings remember the solution before, one by
         this model of the same scene."""
@@ -123,9 +131,15 @@ class StrainDependent(SteppedModel):
         return Near(self, scene, forces, ArmSolution(xi, coupled, problem.couplings))
 
     def _solve_together(
-        self, scene: Scene, problem: ArmProblem, guess: ArmUnknown | None = None
+        self,
+        scene: Scene,
+        problem: ArmProblem,
+        guess: ArmUnknown | None = None,
+        *,
+        solved: bool = False,
     ) -> Outcome:
-        unknown, balanced, definite, steps, loose = solve_arm(problem, scene.free, guess)
+        found = solve_arm(problem, scene.free, guess, solved=solved)
+        unknown, balanced, definite, steps, loose = found
         problem = problem.loosened(loose)
         forces, shares = carried_from_start(unknown, problem)
         tau, sections = problem.along_sections(shared(forces, shares)), problem.sections

@@ -2,8 +2,8 @@
 
 XLA takes seconds to optimize a solve that then runs in less than a millisecond. Without
 optimizations it takes a third of that, and the program runs for some milliseconds. So a program is
-compiled quickly at first; one that has run for `LONG` is compiled again in the background, and
-replaced when that is ready. Both are kept on disk, see `program_store`.
+compiled quickly at first; one that has run for as long as that took is compiled again in the
+background, and replaced when that is ready. Both are kept on disk, see `program_store`.
 """
 
 import gc
@@ -21,6 +21,8 @@ from weakref import WeakSet
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
@@ -29,8 +31,9 @@ from . import program_store
 VARIABLE = "VSR_JAX_TIERS"
 """Environment variable; "off" compiles every program once, with XLA's defaults."""
 
-LONG = 2.0
-"""Seconds that a quick program runs before it is compiled again."""
+LONG = 4e-6
+"""Seconds that a quick program runs, for each character of its text, before it is compiled again:
+about as long as XLA took to compile it."""
 
 SILENT = 3.0
 """Seconds of compiling after which a message appears."""
@@ -47,6 +50,8 @@ _SETTINGS = (
     "jax_debug_infs",
 )
 """Settings of JAX that a traced program depends on."""
+
+_OF_NUMPY = np.ndarray, np.generic
 
 _shown: ContextVar[bool] = ContextVar("shown", default=True)
 _programs: WeakSet["Program"] = WeakSet()
@@ -85,6 +90,7 @@ class Program:
     def _kind(self, args: tuple, kwargs: dict) -> tuple["_Kind | None", list[Array]]:
         """The program for arguments of this kind, and their arrays; None where JAX compiles it."""
         leaves, structure = jax.tree.flatten((args, kwargs))
+        leaves = [jnp.asarray(x) if isinstance(x, _OF_NUMPY) else x for x in leaves]
         arrays = [x for x in leaves if isinstance(x, jax.Array)]
         if any(isinstance(x, Tracer) for x in arrays):
             return None, arrays
@@ -123,6 +129,7 @@ class _Kind:
         best = program_store.stored(lowered, {}) if quick else None
         self._run = best or program_store.compiled(lowered, quick)
         self._lowered = lowered if quick and best is None else None
+        self._long = LONG * len(lowered.as_text())
 
     def __call__(self, arrays: list[Array]) -> Any:
         if self._lowered is None:
@@ -131,7 +138,7 @@ class _Kind:
             begin = time.perf_counter()
             found = jax.block_until_ready(self._run(arrays))
             self._ran += time.perf_counter() - begin
-            if self._ran > LONG and not self._improving:
+            if self._ran > self._long and not self._improving:
                 self._improving = True
                 _improver.add(self)
         return jax.tree.unflatten(self._structure, _filled(self._static, found))
