@@ -8,6 +8,7 @@ user, are left as they are set.
 import hashlib
 import os
 import platform
+import re
 import sys
 import tempfile
 from functools import cache
@@ -82,8 +83,32 @@ def _path(lowered: Lowered, options: dict[str, Any]) -> Path | None:
     where = _usable(folder())
     if where is None:
         return None
-    said = (lowered.as_text(), sorted(options.items()), os.environ.get("XLA_FLAGS", ""), _machine())
+    said = (
+        _canonical(lowered.as_text()),
+        sorted(options.items()),
+        os.environ.get("XLA_FLAGS", ""),
+        _machine(),
+    )
     return where / (hashlib.sha256(repr(said).encode()).hexdigest() + _KIND)
+
+
+def _canonical(text: str) -> str:
+    """The text of a program, with the functions that it calls named by hashes of their texts.
+
+    JAX lets calls share a function if an equal one from earlier is still in memory, so that names
+    depend on when Python last looked for garbage.
+    """
+    head, *parts = re.split(r"^  func\.func \w+ @([\w.]+)", text, flags=re.MULTILINE)
+    bodies = {name: body.rstrip("} \n") for name, body in zip(parts[::2], parts[1::2], strict=True)}
+
+    @cache
+    def name(function: str) -> str:
+        return hashlib.sha256(named(bodies[function]).encode()).hexdigest()
+
+    def named(body: str) -> str:
+        return re.sub(r"@([\w.]+)", lambda x: name(x[1]) if x[1] in bodies else x[0], body)
+
+    return head + named(bodies["main"])
 
 
 @cache
