@@ -72,6 +72,7 @@ def test_solution_is_scipys(sections, tau):
         )
 
 
+@pytest.mark.slow
 def test_no_force_is_rest_with_finite_derivatives(sections):
     one = at(sections, 1)._replace(paths=at(sections, 1).paths[:1])
 
@@ -136,6 +137,7 @@ def test_lost_stability_is_reported():
     assert bool(jnp.isnan(eq.stability))
 
 
+@pytest.mark.slow
 def test_bad_lanes_change_neither_the_others_nor_their_gradients():
     scene = paper.scene("B1")
 

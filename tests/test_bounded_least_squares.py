@@ -66,6 +66,7 @@ def test_another_start_follows_where_one_leads_nowhere():
     np.testing.assert_allclose(found[1], 0.9, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1, 6])
 def test_a_batch_finds_what_each_finds_alone(size):
     targets = jnp.asarray(np.random.default_rng(size).uniform(0.1, 0.9, (5, 3)))

@@ -37,6 +37,7 @@ def test_lengths_give_back_the_tensions(pulled):
     np.testing.assert_allclose(driven.slack, 0.0)
 
 
+@pytest.mark.slow
 def test_prescribed_lengths_are_slack_or_taut(pulled):
     """On both sides of the switch: the second cable is let out to 1 um short of, and 1 um past,
     where it goes slack."""
@@ -104,6 +105,7 @@ class Corner(Routing):
         return (self.place,)
 
 
+@pytest.mark.slow
 def test_a_corner_of_the_path_holds_tension_back():
     r"""Over a corner of angle $\Delta$ a tendon keeps $e^{-\mu \Delta}$ of its tension, or the
     inverse when it is let go."""
@@ -176,6 +178,7 @@ def test_friction_agrees_between_the_models():
     np.testing.assert_allclose(tips[1], tips[0], atol=2e-7)
 
 
+@pytest.mark.slow
 def test_a_thread_that_ends_leaves_the_rest_straight():
     """Beyond its end the arm is straight; before it, it is the arm with a whole thread."""
     ends = vsr.Scene(ARM, [vsr.Tendon(vsr.Parallel(0.007, 0.0), start=0.05, end=0.2)])
@@ -213,6 +216,7 @@ def test_jumps_in_everything_agree_with_the_continuum():
     np.testing.assert_allclose(tips[1], tips[0], atol=1e-8)
 
 
+@pytest.mark.slow
 def test_locked_strains_keep_their_rest_value():
     loads = [vsr.TipWrench((0.0, 0.05, -0.1))]
     bending = vsr.Scene(ARM, scene().actuators, loads, free_strains=("bending_y", "bending_z"))

@@ -232,6 +232,7 @@ MATTIASSON = {
 Meth. Eng. 17 (1981), to five digits."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("load", [0.1, 1.0, 2.0, 5.0, 10.0])
 def test_elastica_under_a_dead_force_is_bisshopp_and_druckers(load):
     """Whole shape by elliptic integrals (Bisshopp & Drucker 1945), end as in Mattiasson's table of

@@ -54,6 +54,7 @@ def gaps_of(eq):
     return Clearance(0.004, [BALL, BOX])(Arms.of(eq)).reshape(2, 65) * L + 0.004
 
 
+@pytest.mark.slow
 def test_the_clearance_is_that_of_the_nearest_point():
     """Between the 65 stations as well."""
     eq = bare(BESIDE)
@@ -64,6 +65,7 @@ def test_the_clearance_is_that_of_the_nearest_point():
         assert np.all(gaps <= at_stations + 1e-12)
 
 
+@pytest.mark.slow
 def test_derivatives_of_the_clearance():
     def least(inputs):
         return jnp.min(gaps_of(vsr.solve(FREE, inputs, model=MODEL)))
@@ -84,6 +86,7 @@ def among(inputs):
     return jnp.stack(least), eq
 
 
+@pytest.mark.slow
 def test_margins_of_an_arm_that_touches():
     """Where it presses the clearance is that of the force, by 3 EI / L^3 of the arm; else of the
     gap."""

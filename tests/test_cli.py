@@ -231,6 +231,7 @@ def test_version(capsys):
     assert capsys.readouterr().out.strip() == f"vsr-jax {vsr_jax.__version__}"
 
 
+@pytest.mark.slow
 def test_sweep_keeps_and_draws_a_workspace(tmp_path, capsys):
     arguments = [
         "sweep",
@@ -265,6 +266,7 @@ def test_sweep_keeps_and_draws_a_workspace(tmp_path, capsys):
     assert said.endswith(": status[0:50]")
 
 
+@pytest.mark.slow
 def test_matplotlib_is_imported_only_to_draw():
     code = (
         "import sys; from vsr_jax.cli import main; "
@@ -286,6 +288,7 @@ def test_a_sweep_to_disk_without_zarr_is_one_line(tmp_path, capsys, monkeypatch)
     )
 
 
+@pytest.mark.slow
 def test_a_sweep_without_a_solution_exits_with_1(capsys):
     assert (
         cli.main(
@@ -319,6 +322,7 @@ def test_bounds_of_a_sweep_are_one_or_one_an_actuator(capsys):
     )
 
 
+@pytest.mark.slow
 def test_a_tolerance_chooses_the_steps_and_tells_the_error(capsys):
     assert cli.main(["solve", HELIX, "--tolerance", "1e-4"]) == cli_common.DONE
     error = re.search(

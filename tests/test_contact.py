@@ -43,6 +43,7 @@ def pressed():
     return solved(PRESS, obstacles=SPHERE)
 
 
+@pytest.mark.slow
 def test_contact_pushes_only_where_the_gap_is_closed(pressed):
     contacts = pressed.contacts
     assert float(contacts.force.max()) > 0.02
@@ -55,6 +56,7 @@ def test_contact_pushes_only_where_the_gap_is_closed(pressed):
     assert float(gap.min()) > -1e-4 * 0.005
 
 
+@pytest.mark.slow
 def test_soft_arms_do_not_pass_what_they_touch():
     """Pressed across a pillar at many places of a step, the arm shears and bends within the step;
     positions between the contacts too stay outside."""
@@ -111,6 +113,7 @@ def test_contacts_of_an_arm_along_a_wall_push_only_where_the_gap_is_closed():
         assert np.max(np.minimum(gap, force)) < 1e-8
 
 
+@pytest.mark.slow
 def test_a_touching_arm_is_the_free_arm_under_its_contact_force(pressed):
     """The same arm without obstacle, loaded by the contact force: other code, with the force at a
     breakpoint."""
@@ -126,6 +129,7 @@ def test_a_touching_arm_is_the_free_arm_under_its_contact_force(pressed):
     np.testing.assert_allclose(base, whole, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_solve_may_start_from_the_free_arm(pressed):
     free = solved(vsr.TipWrench(force=(0, 0.005, -0.005)))
     np.testing.assert_allclose(
@@ -136,6 +140,7 @@ def test_a_solve_may_start_from_the_free_arm(pressed):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("round_first", [True, False])
 def test_a_solve_may_start_from_an_arm_among_other_obstacles(round_first):
     """A plane has another number of contacts than a sphere."""
@@ -147,6 +152,7 @@ def test_a_solve_may_start_from_an_arm_among_other_obstacles(round_first):
     np.testing.assert_allclose(warm.tip, cold.tip, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", ["one load at the tip's abscissa", "two loads at one place"])
 def test_steps_of_no_length_touch_nothing(pressed, where):
     """Both leave a step without length in the grid, and other steps a little longer."""
@@ -160,6 +166,7 @@ def test_steps_of_no_length_touch_nothing(pressed, where):
     np.testing.assert_allclose(jnp.sum(eq.contacts.force), jnp.sum(same.contacts.force), rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_a_base_of_six_digits_is_a_base():
     """An arm that lies along a floor: with such a base as it is, hundreds of Newton steps."""
     turn = vsr.se3.exp(jnp.array([0.3, -1.1, 0.7, 0.0, 0.0, 0.0]))
@@ -200,6 +207,7 @@ def test_contact_has_exact_derivatives_and_batches(pressed):
     assert abs(float(many[0])) < 1e-3  # 5 mN aside alone
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [True, False])
 def test_a_plane_may_touch_the_ends_of_steps_too(pressed, first):
     floor = vsr.Plane((0, 0, 1), (0, 0, -0.2))
@@ -219,6 +227,7 @@ def test_a_plane_may_touch_the_ends_of_steps_too(pressed, first):
     np.testing.assert_allclose(contacts.gap[plane], contacts.position[plane, :, 2] + 0.195)
 
 
+@pytest.mark.slow
 def test_many_arms_wait_in_a_queue():
     """More arms than are solved at a time, and each is the arm alone."""
 
@@ -244,6 +253,7 @@ def test_of_two_steps_at_a_contact_one_has_its_force():
     np.testing.assert_array_equal(handed, [[1.0, 0.0, 0.0, 0.0, 1.0, 0.0]])
 
 
+@pytest.mark.slow
 def test_a_heavy_arm_lies_on_the_floor():
     """Far from the lift-off the floor carries the weight of each step."""
     floor = vsr.Plane((0, 0, 1), (0, 0, -0.02))
@@ -257,6 +267,7 @@ def test_a_heavy_arm_lies_on_the_floor():
     assert int(jnp.sum(force > 1e-2 * of_step)) in range(9, 12)
 
 
+@pytest.mark.slow
 def test_single_precision(pressed):
     scene = pressed.scene.astype(jnp.float32)
     eq = vsr.solve(scene, NO_INPUTS.astype(jnp.float32), model=MODEL)

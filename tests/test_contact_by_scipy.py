@@ -73,6 +73,7 @@ def axis(eq, pieces):
     return np.asarray(eq.position(jnp.linspace(0, L, pieces + 1)[1:]))[:, [0, 2]]
 
 
+@pytest.mark.slow
 def test_an_arm_that_leans_on_a_pillar():
     r"""Against shooting: $EI \theta'' = F_x \sin\theta - F_z \cos\theta$ with the force F beyond
     each section, which the contact changes; the arm touches the pillar there, and its tip is free
@@ -108,6 +109,7 @@ def test_an_arm_that_leans_on_a_pillar():
     np.testing.assert_allclose(contacts.force.sum(), unknown[2] * EI, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_curved_arm_on_a_ball_in_space():
     r"""Against shooting along a rod that bends and twists: $m' = f \times r'$ with the force f
     beyond each section, $R' = R \hat k$ and $k = K^{-1} R^T m + k_0$. Unknown are the moment at

@@ -54,6 +54,7 @@ def carried(strain, tension):
     return force + pull, moment + np.cross(OFFSET, pull)
 
 
+@pytest.mark.slow
 def test_base_and_ball_are_in_balance(rough):
     status, contacts, strain, _ = rough
     assert np.all(status == vsr.Status.CONVERGED)

@@ -98,6 +98,7 @@ def distance(eq, lying):
     return np.linalg.norm(axis - lying.axis, axis=1).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [low, high, raised])
 def test_the_shape_and_the_touch_down_of_an_arm_on_a_floor(case):
     lying, steps = case(), 48
@@ -141,6 +142,7 @@ def soft_arm(density, *, floor=-0.02, held=(), steps=24):
     return vsr.solve(scene, jnp.zeros(0), model=vsr.StrainDependent(steps))
 
 
+@pytest.mark.slow
 def test_an_arm_that_lies_along_a_floor_hardly_passes_it():
     """Steps that lie flat touch the floor at their ends too: with their nearest points alone most
     arms passed it by 5e-4 of the radius, and some by 1.4e-3."""
@@ -156,6 +158,7 @@ def test_an_arm_that_lies_along_a_floor_hardly_passes_it():
     assert passed.max() < 5e-4
 
 
+@pytest.mark.slow
 def test_a_section_held_on_a_floor_does_not_touch_it_too():
     end = vsr.Held(position=[0.2, 0.0, 0.0])
     eq = soft_arm(1000.0, floor=-0.005, held=end, steps=12)
@@ -168,6 +171,7 @@ def test_a_section_held_on_a_floor_does_not_touch_it_too():
     np.testing.assert_allclose(held, weight, rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("density", [1200.0, pytest.param(700.0, marks=pytest.mark.slow)])
 def test_an_arm_that_lies_along_a_floor_is_differentiated(density):
     """Half of the steps lie on the floor, where the place of a contact in its step is given by the

@@ -103,6 +103,7 @@ class Elastica:
         return np.array([x for x, _, _ in states[1:]]), np.array([f for _, _, f in states[1:]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("friction", "sticking"), [(0.3, 0), (1.0, 2)])
 def test_a_finger_sticks_and_slips_on_a_floor(friction, sticking):
     status, tips, force, rubbing = followed(friction, PATH)
@@ -133,6 +134,7 @@ def test_without_friction_a_path_has_no_memory():
     np.testing.assert_allclose(rubbing, 0.0, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_one_equilibrium_has_no_friction():
     tension = jnp.array([0.8])
     rough, smooth = (vsr.solve(arm(friction), tension, model=MODEL) for friction in (0.5, None))

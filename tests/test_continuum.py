@@ -43,6 +43,7 @@ def printed_rate(scene, tau, xi, X):
     return jnp.linalg.solve(stiffness(X) - A, a - b - c)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["C1", "C2"])
 def test_right_side_is_eq_12_and_13_as_printed(case):
     scene = paper.scene(case)
@@ -77,6 +78,7 @@ def test_too_few_steps_are_reported(helix):
         _ = eq.q
 
 
+@pytest.mark.slow
 def test_precision_follows_the_inputs(dtype, helix):
     reference = paper.reference("B1")[0]
     eq = vsr.solve(helix, jnp.asarray(reference.tau, dtype), model=vsr.Continuum())

@@ -43,6 +43,7 @@ def test_there_is_one_example_of_each():
     assert [heading for heading, _ in EXAMPLES] == HEADINGS
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("code", [pytest.param(code, id=heading) for heading, code in EXAMPLES])
 def test_an_example_is_short_and_true(code, tmp_path):
     lines = code.splitlines()

@@ -34,6 +34,7 @@ def always(size, damping):
     return size == size
 
 
+@pytest.mark.slow
 def test_a_wrong_sign_near_the_root_is_rounding_in_single_precision():
     stable = solved((1.0, 2.0), wrong_near_the_root, jnp.float32)
     assert stable.converged

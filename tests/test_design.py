@@ -73,6 +73,7 @@ OBJECTIVES = {
 }
 
 
+@pytest.mark.slow
 def test_a_thread_leaves_the_axis():
     """On the axis the distance to it has no derivative; the gradient of Inside was NaN."""
     start = vsr.Scene(arm().rod, [vsr.Tendon(vsr.Parallel(0.0, 0.0))])
@@ -96,6 +97,7 @@ def test_a_thread_leaves_the_axis():
     assert np.all(np.isfinite(found.history.objective))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [
@@ -123,6 +125,7 @@ def test_gradients_of_objectives_against_differences(scene, tips, name):
         )
 
 
+@pytest.mark.slow
 def test_values_of_objectives(scene, tips):
     arms = formulate(scene, FREE, Tension(1.0), SETS, (), {}, MODEL)[1].arms({}, {})
     own = np.array([vsr.solve(scene, jnp.array(u), model=MODEL).tip[:3, 3] for u in SETS])
@@ -139,6 +142,7 @@ def test_values_of_objectives(scene, tips):
     assert float((3 * TipError(wanted))(arms)) == pytest.approx(3 * float(TipError(wanted)(arms)))
 
 
+@pytest.mark.slow
 def test_margins_of_constraints_against_independent_code(scene):
     arms = formulate(scene, FREE, Tension(1.0), SETS, (), {}, MODEL)[1].arms({}, {})
     phases = 0.3, 2.0
@@ -199,6 +203,7 @@ def test_a_design_survives_a_scene_file(found, tips):
     )
 
 
+@pytest.mark.slow
 def test_constraints_hold_where_they_bind():
     """The optimum lies at the wall and at the largest tension; both constraints hold there."""
     scene = vsr.Scene(arm().rod, [vsr.Tendon(vsr.Parallel(0.003, 0.0))])
@@ -223,6 +228,7 @@ def test_constraints_hold_where_they_bind():
     assert 0.99 * 1.5 < T <= 1.5
 
 
+@pytest.mark.slow
 def test_an_uncertain_design_is_the_mean_over_its_draws(scene, tips):
     uncertain = {"rod.material.young": 0.1}
     _, terms, given = formulate(scene, FREE, TipError(tips), SETS, (), uncertain, MODEL)
@@ -236,6 +242,7 @@ def test_an_uncertain_design_is_the_mean_over_its_draws(scene, tips):
     assert float(terms(given)[0]) == pytest.approx(np.mean(alone))
 
 
+@pytest.mark.slow
 def test_an_interrupted_design_resumes_bit_identically(scene, tips, tmp_path, monkeypatch):
     search = {"starts": 2, "steps": 60, "candidates": 2}
 

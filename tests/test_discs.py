@@ -52,6 +52,7 @@ def planar_segment(tension, offset, length):
     return end(brentq(aside, -0.2, 1.5, xtol=1e-14))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("discs", "tension"), [(1, 0.4), (3, 4.0)])
 def test_an_arm_in_a_plane_is_that_of_a_separate_integration(discs, tension):
     arm = vsr.Scene(
@@ -81,6 +82,7 @@ def test_a_robot_of_two_sections_is_that_of_rods_between_its_discs():
         np.testing.assert_allclose(found, expected, atol=2e-6 * length)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("discs", [1, 3])
 def test_a_central_tendon_buckles_the_arm_between_its_discs(discs):
     r"""At $T = \pi^2 EI / s^2$, with sines between discs at distance s and the margin $1 - T s^2 /
@@ -118,6 +120,7 @@ def test_few_steps_between_discs_converge_with_their_order():
     assert np.all(np.log2(np.divide(errors[:-1], errors[1:])) > 5.0), errors
 
 
+@pytest.mark.slow
 def test_the_derivative_of_the_energy_by_a_tension_is_the_sum_of_chords(weighed):
     def energy(change):
         return vsr.solve(weighed.scene, TENSIONS + 1e-2 * change, model=FINE).energy.total
@@ -126,6 +129,7 @@ def test_the_derivative_of_the_energy_by_a_tension_is_the_sum_of_chords(weighed)
     np.testing.assert_allclose(slope, weighed.lengths, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_moment_at_the_tip_leaves_an_arm_with_discs_stable():
     """The pivots of its tangent without the turning of the chords miss pairs of its negative
     eigenvalues, since a moment has no potential."""
@@ -144,6 +148,7 @@ def test_a_moment_at_the_tip_leaves_an_arm_with_discs_stable():
     assert jnp.all(margin > 0.5)
 
 
+@pytest.mark.slow
 def test_an_arm_with_discs_under_gravity_is_not_probed():
     """The pivots leave no doubt where the loads have a potential: probing would take as many steps
     again."""
@@ -161,6 +166,7 @@ def test_an_arm_with_discs_under_gravity_is_not_probed():
     assert jnp.all(steps <= 12), steps
 
 
+@pytest.mark.slow
 def test_lengths_give_back_the_tensions(weighed):
     driven = scene([vsr.Gravity()], discs=3, control="length")
     changes = weighed.lengths - jnp.array([driven.rest_length(i) for i in range(2)])
@@ -174,6 +180,7 @@ def test_lengths_give_back_the_tensions(weighed):
     )
 
 
+@pytest.mark.slow
 def test_a_tendon_is_drawn_as_chords(weighed):
     corners = weighed.thread(1, jnp.array([0.0, 0.1, 0.2, 0.3]))
     lengths = np.linalg.norm(np.diff(corners, axis=0), axis=1)
@@ -214,6 +221,7 @@ def test_gradients_in_both_modes_are_finite_differences():
     assert np.all(np.abs(forward) > 1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loads", [(), (vsr.Gravity(),)])
 def test_a_batch_is_its_arms(loads):
     arm = scene(loads, discs=3)
@@ -227,6 +235,7 @@ def test_a_batch_is_its_arms(loads):
     )
 
 
+@pytest.mark.slow
 def test_precision_is_that_of_the_inputs(dtype):
     exact = vsr.solve(scene(discs=3), TENSIONS, model=STEPS, throw=True)
     eq = vsr.solve(scene(discs=3), TENSIONS.astype(dtype), model=STEPS, throw=True)
@@ -234,6 +243,7 @@ def test_precision_is_that_of_the_inputs(dtype):
     np.testing.assert_allclose(eq.tip[:3, 3], exact.tip[:3, 3], atol=50 * epsilon(dtype))
 
 
+@pytest.mark.slow
 def test_places_of_even_discs_are_their_number():
     by_number = vsr.solve(scene(discs=3), TENSIONS, model=FINE, throw=True)
     by_places = vsr.solve(scene(disc_places=[0.1, 0.2]), TENSIONS, model=FINE, throw=True)
@@ -244,6 +254,7 @@ def test_places_of_even_discs_are_their_number():
     np.testing.assert_allclose(none.tip, one.tip, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_slack_tendon_with_discs_does_nothing():
     straight = vsr.solve(scene([vsr.Gravity()], discs=3), [0.0, 0.0], model=STEPS, throw=True)
     bare = vsr.solve(vsr.Scene(ARM, loads=[vsr.Gravity()]), [], model=STEPS, throw=True)

@@ -25,14 +25,6 @@ ELSEWHERE = {
     DOCS / "files.md",
     DOCS / "live_view.md",
 }
-SLOW = {
-    *(
-        DOCS / "guides" / f"{name}.md"
-        for name in ("catheter", "pneumatic_arm", "calibrate", "design", "obstacles")
-    ),
-    DOCS / "api" / "obstacles.md",
-}
-"""Arms under loads, fits and designs compile for long."""
 BLOCK = re.compile(
     r"^```python\n(?P<code>.*?)^```$(?:\n\n^```text\n(?P<output>.*?)^```$)?",
     flags=re.MULTILINE | re.DOTALL,
@@ -64,15 +56,8 @@ def quick_start():
     return names
 
 
-@pytest.mark.parametrize(
-    "page",
-    [
-        pytest.param(
-            page, id=str(page.relative_to(DOCS)), marks=[pytest.mark.slow] if page in SLOW else []
-        )
-        for page in PAGES
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(DOCS)))
 def test_the_code_of_a_page_runs(page, request, tmp_path, monkeypatch):
     matplotlib.use("Agg")
     continued = page.parent.name == "api"

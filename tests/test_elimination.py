@@ -71,6 +71,7 @@ def error(loads, order, steps=16):
     return float(jnp.sqrt(off / size))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LOADS)
 @pytest.mark.parametrize(
     ("order", "bound"),
@@ -81,6 +82,7 @@ def test_it_is_that_of_the_collocation(name, order, bound):
     assert error(LOADS[name], order) < bound
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BY_POSITION)
 @pytest.mark.parametrize(
     ("order", "ratio"), [(2, 0.27), pytest.param(4, 0.52, marks=pytest.mark.slow)]
@@ -92,6 +94,7 @@ def test_by_positions_it_converges_with_the_cells(name, order, ratio):
     assert fine < ratio * coarse
 
 
+@pytest.mark.slow
 def test_a_small_change_of_a_heavy_arm_takes_few_steps():
     scene = vsr.Scene(ROD, [TENDON], LOADS["gravity"])
     model = vsr.StrainDependent(16)
@@ -102,6 +105,7 @@ def test_a_small_change_of_a_heavy_arm_takes_few_steps():
     np.testing.assert_allclose(warm.tip, cold.tip, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_a_batch_in_parts_is_the_same_as_each_arm_alone():
     """300 arms are solved in three parts, the last one filled up."""
     scene, model = vsr.Scene(ROD, [TENDON], LOADS["gravity"]), vsr.StrainDependent(4)
@@ -116,6 +120,7 @@ def test_a_batch_in_parts_is_the_same_as_each_arm_alone():
         np.testing.assert_allclose(batch[i], tip(tensions[i]), atol=1e-10)
 
 
+@pytest.mark.slow
 def test_locked_strains_stay_at_rest():
     """Newton's method works in single precision: rounding that its steps leave in a locked strain
     would become an error of the shape, which no residual shows."""
@@ -152,6 +157,7 @@ BY_STEPS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BY_STEPS)
 def test_one_arm_step_by_step_is_a_batch_node_by_node(name):
     """The same solution and the same verdict of definiteness, for states of all kinds."""

@@ -22,6 +22,7 @@ def tip_distance(a, b):
     return float(jnp.linalg.norm((a.tip - b.tip)[:3, 3]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("steps", "order"), [(8, 6), (16, 6), (13, 6), (16, 4), (64, 2)])
 def test_tip_error_of_the_steps(steps, order):
     eq = vsr.solve(HELICES, PULL, model=vsr.StrainDependent(steps, order))
@@ -31,6 +32,7 @@ def test_tip_error_of_the_steps(steps, order):
     )
 
 
+@pytest.mark.slow
 def test_tip_error_of_one_step_and_of_an_arm_in_pieces():
     tapering, stiff = (
         vsr.Circular(vsr.Taper(0.012, 0.010)),
@@ -62,6 +64,7 @@ class Softened(vsr.StrainDependent):
         return super().strain(scene, tuple(0.99 * force for force in forces), state, X)
 
 
+@pytest.mark.slow
 def test_a_model_that_is_not_balanced_is_not_taken_for_one_that_is():
     """Its strain is compared with one in balance; as that of a `StrainDependent` it was called
     exact."""
@@ -74,6 +77,7 @@ def test_a_model_that_is_not_balanced_is_not_taken_for_one_that_is():
     honest(float(eq.error.tip), tip_distance(eq, exact))
 
 
+@pytest.mark.slow
 def test_errors_against_the_independent_reference():
     entry = paper.reference("B2")[0]
     eq = vsr.solve(HELICES, entry.tau, model=vsr.StrainDependent(12))

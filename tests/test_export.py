@@ -161,6 +161,7 @@ def made(request, tmp_path_factory):
     return Made(request.param, tmp_path_factory.mktemp("export"))
 
 
+@pytest.mark.slow
 def test_other_readers_find_a_closed_body_of_the_scenes_volume(made):
     assert made.mesh.is_watertight
     assert made.mesh.is_winding_consistent
@@ -174,6 +175,7 @@ def test_other_readers_find_a_closed_body_of_the_scenes_volume(made):
     assert (solid.status(), solid.genus()) == (manifold3d.Error.NoError, HANDLES[made.name])
 
 
+@pytest.mark.slow
 def test_sections_and_channels_are_where_the_scene_says(made):
     """At ten abscissas, by cutting the mesh."""
     X = np.linspace(0.013, 0.987, 10) * made.length
@@ -301,6 +303,7 @@ def test_lengths_of_a_bent_arm(made):
     np.testing.assert_allclose(bent, expected, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_guide_runs(tmp_path, monkeypatch):
     page = pathlib.Path(__file__).parents[1] / "docs" / "fabrication.md"
     (code,) = re.findall(r"^```python\n(.*?)^```$", page.read_text(), re.MULTILINE | re.DOTALL)
@@ -338,6 +341,7 @@ def test_the_command_writes_what_it_is_asked_for(tmp_path):
     assert re.search(r"^vsr-jax: warning: the wall between .* less than 5 mm$", err, re.MULTILINE)
 
 
+@pytest.mark.slow
 def test_the_command_bends_the_arm_and_says_what_is_wrong(tmp_path):
     step = tmp_path / "arm.step"
     assert run("--inputs", -15, "--step", step)[0] == cli_common.DONE

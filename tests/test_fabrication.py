@@ -23,6 +23,7 @@ def arc():
     return vsr.Scene(rod, [vsr.Tendon(vsr.Parallel(0.005, 0.001))])
 
 
+@pytest.mark.slow
 def test_drilling_plan_and_lengths():
     """The closed forms of a helix and of an oblique line."""
     discs, helix = [0.0, 0.02, 0.21, 0.3], vsr.Helix(RADIUS, pitch=PITCH)
@@ -64,6 +65,7 @@ def crossing(start=0.002):
     return vsr.Scene(rod, [still, vsr.Tendon(vsr.Linear(start, 0.0, 0.015, 0.0))])
 
 
+@pytest.mark.slow
 def test_thin_walls_are_named():
     with pytest.warns(UserWarning, match="the wall") as told:
         made = vsr.export(crossing(), bore=1e-3, wall=1.2e-3)
@@ -119,6 +121,7 @@ def test_oblique_channels_are_round():
     np.testing.assert_allclose(far, 1e3 * bore / 2, atol=5e-3)
 
 
+@pytest.mark.slow
 def test_threads_in_the_open_have_no_channel():
     """On discs outside a tube, and in its lumen."""
     section = vsr.Annular(0.004, 0.0037)
@@ -132,6 +135,7 @@ def test_threads_in_the_open_have_no_channel():
     assert made.holes.column("radius [mm]")[:2] == [5.0, 1.0]
 
 
+@pytest.mark.slow
 def test_stations_meet_the_tolerance():
     """Chords of an arc and of a helix: the sagitta is h^2 kappa / 8."""
     scene = arc()
@@ -201,6 +205,7 @@ BAD = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BAD)
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.filterwarnings("ignore:the wall")

@@ -41,6 +41,7 @@ def straight_column(weight):
     return numbers | loads | {"tip_radius": numbers["radius"], "curvature": [0.0, 0.0]}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("weight", [5.0, 30.0])
 def test_the_independent_path_ends_where_a_column_buckles(weight):
     path = Arm(STRUCTURES["tip wrench and gravity"], straight_column(weight)).follow()

@@ -31,6 +31,7 @@ def difference(figure, name, folder):
     return 0.0 if found is None else found["rms"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [pytest.param(x, marks=pytest.mark.slow if x in SLOW else ()) for x in figures.FIGURES],

@@ -100,6 +100,7 @@ def test_known_numbers_are_found_again(exact):
     assert "fixed" in str(exact)
 
 
+@pytest.mark.slow
 def test_the_scene_of_a_fit_predicts_the_measurements(exact, clean):
     for series, shift in (("A", TRUTH["base"]), ("B", np.zeros(3))):
         scene = exact.scene_of(series)
@@ -201,6 +202,7 @@ def test_held_out_series_refit_only_their_base(noisy):
     assert folds.mean_square > noisy.chi_squared / noisy.counted.sum()
 
 
+@pytest.mark.slow
 def test_other_measurements_get_only_a_base_of_their_own(exact, clean):
     shift = np.array([0.004, 0.001, -0.002])
     markers = vsr.Markers(clean[4:] + shift, X, offset=OFFSET, sd=2e-4)
@@ -263,6 +265,7 @@ def test_bands_are_those_of_the_linear_model(noisy):
     np.testing.assert_allclose(found.sd[0, 0], sd, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_modulus_and_gain_without_gravity_are_not_determined():
     scene = arm()
     data = measured(positions(scene, INPUTS))
@@ -279,6 +282,7 @@ def test_modulus_and_gain_without_gravity_are_not_determined():
     assert np.isfinite(one.numbers["rod.material.young"].error)
 
 
+@pytest.mark.slow
 def test_single_precision(clean):
     found = fitted(measured(clean.astype(np.float32)))
     assert found.scene.rod.length.dtype == np.float32
@@ -294,6 +298,7 @@ class TipHeight(vsr.Observation):
         return eq.tip[2, 3].reshape(1, 1)
 
 
+@pytest.mark.slow
 def test_every_kind_of_observation():
     """Poses, curvatures, tensions of length-driven tendons and one of the user's own, together with
     an offset of the cables and an offset of the markers."""

@@ -32,6 +32,7 @@ def noisy():
     return vsr.fit(arm(5e5), free, data, model=MODEL, progress=False)
 
 
+@pytest.mark.slow
 def test_it_is_the_sum_of_squares_and_the_prior(noisy):
     """Against solves one after another."""
     measured = np.asarray(noisy.problem.data.observations[0].value)[:, 0]

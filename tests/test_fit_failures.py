@@ -37,6 +37,7 @@ def fitted(data):
     return vsr.fit(arm(START), FREE, data, model=MODEL, progress=False)
 
 
+@pytest.mark.slow
 def test_a_shape_that_fails_at_the_start_counts_once_it_can_be_solved():
     """Tensions that crush the soft arm of the start, but not the true one."""
     inputs = np.array([[0.5, 0.2], [0.3, 0.9], [0.8, 0.6], [4.0, 6.0]])
@@ -49,6 +50,7 @@ def test_a_shape_that_fails_at_the_start_counts_once_it_can_be_solved():
     np.testing.assert_allclose(found.x, YOUNG, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_shape_without_derivatives_is_named_and_has_no_weight():
     """Without tension the arm is straight; the slopes of its deflection are NaN."""
     inputs = np.array([[0.5, 0.2], [0.0, 0.0], [0.3, 0.9], [0.8, 0.6]])

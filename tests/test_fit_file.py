@@ -66,6 +66,7 @@ def folder(tmp_path_factory):
     return place
 
 
+@pytest.mark.slow
 def test_the_command_finds_the_numbers(folder, capsys):
     out, record, plot = folder / "found.toml", folder / "found.json", folder / "found.png"
     arguments = ["fit", str(folder / "fit.toml"), "--out", str(out), "--json", str(record)]

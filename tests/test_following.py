@@ -79,6 +79,7 @@ def tips(scene, tensions, **options):
     return jax.vmap(lambda eq: eq.tip[:3, 3])(path)
 
 
+@pytest.mark.slow
 def test_a_closed_cycle_returns_to_its_turning_point():
     """The hysteresis of a play operator: inner loops close, and the outer one ends where the first
     pull ended."""
@@ -157,6 +158,7 @@ def test_paths_batch_and_in_single_precision():
     np.testing.assert_allclose(ends[1][0], tips(scene, [1.0, 4.0, 2.0])[-1], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_without_friction_the_arm_stays_in_its_equilibrium():
     """A soft column in gravity, bent to one side and let go, hangs over that side: the same inputs,
     two equilibria."""

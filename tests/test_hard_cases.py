@@ -254,6 +254,7 @@ def test_the_papers_arm_collapses_at_93_newtons(tension, status):
     assert vsr.solve(paper.scene("A1"), jnp.array([-tension]), model=MODEL).status == status
 
 
+@pytest.mark.slow
 @DOUBLE_OR_SLOW
 def test_more_steps_resolve_the_fifty_turns(dtype):
     scene, forces, *_ = TABLE["helix of fifty turns"]

@@ -165,6 +165,7 @@ PRECISIONS = pytest.mark.parametrize(
 )
 
 
+@pytest.mark.slow
 @PRECISIONS
 @pytest.mark.parametrize("name", TABLE)
 def test_status_and_shape_are_what_they_must_be(name, dtype):
@@ -361,6 +362,7 @@ def test_arms_of_every_slenderness_bear_a_tip_force_in_a_hundred_directions(step
     assert np.max(np.linalg.norm(rough_tips - tips, axis=1)[converged]) < 5e-6
 
 
+@pytest.mark.slow
 def test_a_catheter_bears_a_tip_force_in_any_direction():
     """Two of a hundred were refused: four tendons in a wire of 1 mm and 60 GPa, 0.5 N at its
     tip."""
@@ -384,6 +386,7 @@ def test_a_catheter_bears_a_tip_force_in_any_direction():
     assert np.all(found == vsr.Status.CONVERGED)
 
 
+@pytest.mark.slow
 def test_a_tapered_arm_of_silicone_upright_under_its_weight_is_unstable():
     """At exactly zero pressure nothing tips it over; the straight equilibrium is found, and is none
     that stays."""
@@ -405,6 +408,7 @@ def test_a_tapered_arm_of_silicone_upright_under_its_weight_is_unstable():
     assert list(found) == [UNSTABLE, vsr.Status.CONVERGED]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("force", "moment"), [((5.59, 0.48), 5.37), ((1.4, -2.7), 5.7)])
 def test_an_arm_in_a_plane_that_is_unstable_across_it_is_found_out(force, moment):
     """A dead moment bends the arm in the plane of all loads. Its tangent has a pair of eigenvalues

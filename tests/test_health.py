@@ -44,6 +44,7 @@ def strut():
     )
 
 
+@pytest.mark.slow
 def test_tensions_may_grow_until_the_path_has_no_length(twins):
     limit = 1 / (1 / AXIAL + 0.008**2 / BENDING) / 2
     np.testing.assert_allclose(twins.inputs.factor, limit, rtol=1e-3)
@@ -71,6 +72,7 @@ def test_twin_threads_are_not_independent(twins):
     assert str(health).splitlines()[-1] == "  advice       no problems found"
 
 
+@pytest.mark.slow
 def test_a_strut_fails_at_eulers_load(strut):
     # the rod shortens and shears before it buckles, so Euler's load is exact only to its strain
     np.testing.assert_allclose(strut.loads.factor, 2.0, rtol=5e-3)
@@ -100,6 +102,7 @@ def test_a_factor_of_one_within_its_resolution_is_close_to_failure(twins):
     assert "close to failure" not in twins._replace(inputs=below).advice[0]
 
 
+@pytest.mark.slow
 def test_redundant_threads_are_found_in_both_precisions(dtype):
     around = [(math.cos(i * math.pi / 3), math.sin(i * math.pi / 3)) for i in range(6)]
     threads = [vsr.Tendon(vsr.Parallel(0.005 * y, 0.005 * z)) for y, z in around]
@@ -116,12 +119,14 @@ def test_a_thread_without_effect_is_not_independent():
     assert _independence(bending) == 0
 
 
+@pytest.mark.slow
 def test_a_rod_without_inputs_and_loads_has_no_limits():
     health = vsr.check(vsr.Scene(rod()), jnp.zeros(0), model=MODEL)
     assert health.inputs is health.loads is health.independence is None
     assert health.advice == ("no problems found",)
 
 
+@pytest.mark.slow
 def test_it_runs_under_jit(twins):
     again = eqx.filter_jit(lambda scene, inputs: vsr.check(scene, inputs, model=MODEL))(
         twins.equilibrium.scene, twins.equilibrium.inputs
@@ -129,6 +134,7 @@ def test_it_runs_under_jit(twins):
     np.testing.assert_allclose(again.inputs.factor, twins.inputs.factor)
 
 
+@pytest.mark.slow
 def test_a_failed_solve_gets_a_remedy():
     helix = vsr.Scene(rod(), [vsr.Tendon(vsr.Helix(0.005, pitch=LENGTH / 50))])
     health = vsr.check(helix, jnp.array([20.0]), model=vsr.StrainDependent(8))
@@ -140,6 +146,7 @@ def test_a_failed_solve_gets_a_remedy():
     assert 0 < record["inputs"]["factor"] < 1
 
 
+@pytest.mark.slow
 def test_the_command_prints_and_saves_the_report(tmp_path, capsys):
     path = tmp_path / "arm.toml"
     vsr.save(vsr.Scene(rod(), [vsr.Tendon(vsr.Parallel(0.0, 0.008))]), path, [1.0], "An arm")

@@ -23,6 +23,7 @@ def test_a_propped_cantilever_is_held_by_three_eighths_of_its_load():
     np.testing.assert_allclose(eq.tip[2, 3], 0, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("orientation", "load"),
     [(np.eye(3), 4 * np.pi**2), (None, 20.190728556426629)],
@@ -41,6 +42,7 @@ def test_the_margin_of_a_held_column_vanishes_at_its_buckling_load(orientation, 
     np.testing.assert_allclose(eq.stability, 0.5, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_moment_leaves_a_buckled_arm_stable():
     """With a moment the tangent is not symmetric, and its pivots alone miss pairs of the negative
     eigenvalues that the hold takes away; a margin above zero proves that the arm is stable."""
@@ -50,6 +52,7 @@ def test_a_moment_leaves_a_buckled_arm_stable():
     assert eq.stability > 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("free", [("bending_y",), ("bending_y", "elongation")])
 def test_an_arm_in_a_plane_may_be_held_across_it(free):
     """Clamped at one end, in a slide at the other: it sags by F L^3 / (192 EI) in the middle."""
@@ -62,6 +65,7 @@ def test_an_arm_in_a_plane_may_be_held_across_it(free):
     np.testing.assert_allclose(eq.supports[0, 5], 5e-5, rtol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("along", [None, pytest.param((1.0, 0.0, 0.5), marks=pytest.mark.slow)])
 def test_an_arm_in_a_plane_is_held_alike_wherever_the_plane_lies(along):
     """Nothing can move across the plane; no support then pushes there, about no axis in it."""
@@ -117,6 +121,7 @@ def test_a_rigid_piece_may_be_held_twice():
     np.testing.assert_allclose(twice, once, atol=5e-5 * L)
 
 
+@pytest.mark.slow
 def test_a_clamped_elastica_has_the_force_of_the_elliptic_integrals():
     """Both ends clamped, brought to 0.8 L: four quarter waves, 2 E / K - 1 = 0.8 and
     P = (4 K)^2 EI / L^2."""
@@ -143,6 +148,7 @@ def test_held_sections_have_exact_derivatives():
     np.testing.assert_allclose(jax.jit(jax.grad(height))(at), difference, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_clamp_within_the_arm_exerts_the_wrench_that_bends_it_there():
     """A section of an arm on a turned base is clamped in the pose to which a wrench brings it."""
     base = vsr.pose((0.01, 0.0, 0.02), pointing=(1.0, 0.2, 0.1))
@@ -158,6 +164,7 @@ def test_a_clamp_within_the_arm_exerts_the_wrench_that_bends_it_there():
     np.testing.assert_allclose(eq.tip, bent.tip, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_the_margin_of_a_held_arm_can_be_differentiated():
     def margin(push):
         end = vsr.Held(position=jnp.array([L, 0, 0.0]), along=(1, 0, 0))

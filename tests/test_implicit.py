@@ -29,6 +29,7 @@ def square_root(p, other):
     ).x
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
 def test_derivatives_of_both_orders_are_exact_in_both_modes(derivative):
     p = jnp.array(3.0)
@@ -42,6 +43,7 @@ def test_a_parameter_without_influence_has_derivative_zero():
     assert float(jax.grad(square_root, argnums=1)(p, p)) == 0
 
 
+@pytest.mark.slow
 def test_lanes_without_a_root_affect_no_other():
     @jax.grad
     def slope(scale, p):
@@ -55,6 +57,7 @@ def test_lanes_without_a_root_affect_no_other():
     assert np.all(np.isfinite(each))
 
 
+@pytest.mark.slow
 def test_a_function_of_each_node_has_its_own_derivatives():
     """Against those of the function itself: in both modes, to second order, over a batch, and by an
     argument that is the same for all nodes."""

@@ -45,6 +45,7 @@ def some(*quick):
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", some("B1"))
 def test_strain_dependent_is_the_reference(name):
     eq, error = tip_error(name, vsr.StrainDependent(32))
@@ -95,6 +96,7 @@ HEAVY = vsr.Scene(
 BENDING = vsr.Prescribed(vsr.Basis.uniform(vsr.Legendre(3), ("bending_y", "bending_z")))
 
 
+@pytest.mark.slow
 def test_a_prescribed_basis_takes_few_steps_under_gravity():
     """10 to 123 Newton steps, before anything bounded how far one turns the arm."""
 
@@ -263,6 +265,7 @@ def test_bad_scenes_are_refused(make, message, unchecked):
         make()
 
 
+@pytest.mark.slow
 def test_batches_in_batches_are_the_single_solves_and_bad_lanes_harm_none():
     lengths = jnp.array([0.5, 0.4])
     forces = jnp.array([[0.0, 0.0, 0.1], [0.0, 0.1, 0.0], [-0.2, 0.0, 0.05]])

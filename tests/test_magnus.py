@@ -50,6 +50,7 @@ def stepped_tip(steps, order):
     return tip_pose(tuple(jnp.moveaxis(strain(grid.X), 0, 0)), grid.h)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("order", "steps"), [(2, (64, 128)), (4, (16, 32)), (6, (8, 16))])
 def test_steps_converge_with_their_order(order, steps, exact_tip):
     coarse, fine = (np.abs(stepped_tip(n, order) - exact_tip).max() for n in steps)
@@ -88,6 +89,7 @@ def test_steps_start_from_the_base():
     np.testing.assert_allclose(step_poses(parts, grid.h, base)[0], base, atol=1e-15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", ORDERS)
 def test_pose_between_step_ends_has_the_accuracy_of_the_steps(order, helix):
     coarse = vsr.solve(helix, jnp.array([-10.0]), model=vsr.StrainDependent(48, order))
@@ -129,6 +131,7 @@ class TestJacobian:
 
         np.testing.assert_allclose(J, twists(self.q), atol=1e-12)
 
+    @pytest.mark.slow
     def test_is_the_integral_of_eq_15(self):
         """J = Ad_g^-1 int Ad_g B_q ds with the integral by the trapezoidal rule on fine poses,
         extrapolated once."""

@@ -153,6 +153,7 @@ def test_distances_to_planes_spheres_and_endless_cylinders():
     np.testing.assert_allclose(distances(tube, POINTS), 0.05 - off, atol=1e-15)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "ends", "radii"),
     [
@@ -193,6 +194,7 @@ def test_the_wall_of_a_cone_is_that_of_its_balls():
     np.testing.assert_allclose(found, expected, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_finite_differences(obstacle):
     step = 1e-5
     slopes, curvatures = (
@@ -212,6 +214,7 @@ def test_gradients_are_unit_vectors(obstacle):
         np.testing.assert_allclose(size, 1.0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_third_derivatives_of_a_tube():
     tube, step = OBSTACLES["tapered tube"], 1e-5
     third = jax.jit(jax.vmap(jax.jacfwd(jax.hessian(tube.distance))))(POINTS[:5])
@@ -220,6 +223,7 @@ def test_third_derivatives_of_a_tube():
         np.testing.assert_allclose(np.moveaxis(found, -1, 0), expected / step, rtol=1e-5, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_derivatives_are_finite_where_the_normal_is_not_unique():
     sharp, rounded = vsr.Box((0.2, 0.2, 0.2)), vsr.Box((0.2, 0.2, 0.2), rounding=0.1)
     at = [
@@ -250,6 +254,7 @@ def test_distances_do_not_change_in_a_rigid_motion(name):
     np.testing.assert_allclose(distances(moved, points), distances(obstacle, POINTS), atol=1e-14)
 
 
+@pytest.mark.slow
 def test_single_precision(obstacle, dtype):
     points = POINTS.astype(dtype)
     typed = jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, obstacle)
@@ -308,6 +313,7 @@ SCENE = vsr.Scene(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "place"),
     [
@@ -435,6 +441,7 @@ def test_an_obstacle_of_a_user():
         vsr.Scene(arm(base=vsr.pose((0, 0, -0.1))), obstacles=Wall())
 
 
+@pytest.mark.slow
 def test_drawn_surfaces_lie_on_the_obstacle(obstacle):
     points = np.array([[-0.1, -0.1, 0.0], [0.2, 0.1, 0.15]])
     polygons = polygons_of(obstacle, points)

@@ -14,6 +14,7 @@ from vsr_jax.numerics.stacked import total
 SHAPES = [(), (3,), (2, 3, 5)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("summed", [False, True])
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])

@@ -76,6 +76,7 @@ class TestClaims:
         for i in range(4):
             assert error_of("A1", i, paper.basis("A1")) < 1e-9
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(("case", "size"), [("A2", 3), ("A3", 6), ("B1", 6), ("B2", 12)])
     def test_cylinders_are_met_within_a_quarter_percent(self, case, size):
         basis = paper.basis(case)

@@ -18,6 +18,7 @@ WORDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("word", "direction"), WORDS.items())
 def test_a_word_is_a_direction(word, direction):
     g = vsr.pose(pointing=word)

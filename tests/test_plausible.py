@@ -88,6 +88,7 @@ def test_a_wrong_unit_is_named(numbers, sentence):
     assert found[0].startswith(sentence)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
 def test_the_examples_are_plausible(path):
     assert plausible.warnings_of(load(path).scene) == ()

@@ -76,6 +76,7 @@ def test_a_failed_solve_shows_the_arm_at_rest_and_says_why():
     plt.close("all")
 
 
+@pytest.mark.slow
 def test_tensions_have_signed_colours_and_slack_tendons_are_dashed():
     scene = vsr.Scene(
         vsr.Rod(0.3, vsr.Circular(0.01), vsr.Material(8e5, poisson=0.45)),
@@ -109,6 +110,7 @@ def test_the_colour_bar_shows_the_signs_there_are(tensions, ends):
     assert scale.norm(0.0) == 0.5
 
 
+@pytest.mark.slow
 def test_rigid_pieces_have_a_wall_of_their_own():
     pieces = [vsr.RigidPiece(0.101, 0.122), vsr.RigidPiece(0.25)]
     rod = vsr.Rod(0.3, vsr.Circular(0.01), vsr.Material(6e5, poisson=0.4), rigid=pieces)
@@ -126,6 +128,7 @@ def test_rigid_pieces_have_a_wall_of_their_own():
     plt.close("all")
 
 
+@pytest.mark.slow
 def test_discs_are_drawn_and_a_thin_arm_is_widened():
     thread = [vsr.Tendon(vsr.Parallel(0.0005, 0.0))]
     for guide, widened in ((None, True), (0.01, False)):
@@ -148,6 +151,7 @@ def test_discs_are_drawn_and_a_thin_arm_is_widened():
     plt.close("all")
 
 
+@pytest.mark.slow
 def test_labels_do_not_lie_on_ticks(eq):
     """Also of a box that is much longer than wide."""
     for arm in (eq, vsr.solve(vsr.Scene(eq.scene.rod), [])):

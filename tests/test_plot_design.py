@@ -109,6 +109,7 @@ def test_frames_and_loads_are_drawn_onto_an_arm(eq):
     assert widths[0] < widths[1]  # a weight per length does not look like a force at a point
 
 
+@pytest.mark.slow
 def test_the_equilibrium_comes_before_the_axes(unchecked, eq):
     ax = plot.arm(eq)
     for draw in (annotate.loads, annotate.frames, plot.arm):
@@ -118,6 +119,7 @@ def test_the_equilibrium_comes_before_the_axes(unchecked, eq):
         annotate.loads(ax, eq)
 
 
+@pytest.mark.slow
 def test_moments_and_loads_that_depend_on_the_pose_are_drawn(eq):
     loads = [
         vsr.TipWrench(moment=(0.0, 0.0, 1e-3)),
@@ -137,6 +139,7 @@ def test_moments_and_loads_that_depend_on_the_pose_are_drawn(eq):
     assert styles == ["--", "-", "-"]
 
 
+@pytest.mark.slow
 def test_arrows_of_point_forces_have_one_scale(eq):
     loads = [
         vsr.PointWrench(0.1, force=(0.0, 0.0, 0.02)),
@@ -157,6 +160,7 @@ def test_an_ellipsoid_has_its_semi_axes():
     np.testing.assert_allclose(ax.xy_dataLim.intervaly, (-0.4, 0.4), atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_film_has_a_frame_for_each_arm(eq, tmp_path):
     moving = film([eq, eq, eq], tmp_path / "arm.gif", titles=["a", "b", "c"], seconds=1.0, dpi=30)
     assert moving is not None
@@ -171,6 +175,7 @@ def test_a_film_has_a_frame_for_each_arm(eq, tmp_path):
         film([eq, eq], titles=["a"])
 
 
+@pytest.mark.slow
 def test_a_film_keeps_the_last_shape_where_a_solve_failed(eq, tmp_path):
     bare = vsr.Scene(eq.scene.rod, eq.scene.actuators)
     fine, failed = (vsr.solve(bare, [tension], model=MODEL) for tension in (1.0, 1e6))
@@ -213,6 +218,7 @@ def test_a_design_is_drawn_for_every_set_of_inputs_with_its_targets(eq):
         np.testing.assert_allclose(crosses, targets)
 
 
+@pytest.mark.slow
 def test_the_command_designs_saves_and_draws(problem, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(cli_design, "reduce_compile_time", lambda optimise: None)
     out, record, picture = (

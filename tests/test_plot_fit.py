@@ -34,6 +34,7 @@ def fit():
     return vsr.fit(scene, free, data, model=MODEL, progress=False)
 
 
+@pytest.mark.slow
 def test_markers_are_joined_to_their_predictions(fit):
     ax = vsr.plot_fit.shapes(fit, axes="xz")
     plane, good = [0, 2], [0, 1, 3]

@@ -138,6 +138,7 @@ def test_a_spring_stiffens_the_tip_of_a_beam():
     assert float(jax.grad(tip)(0.0)) == pytest.approx(1 / (3 * EI / L**3 + k), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_column_with_a_spring_buckles_where_theory_says():
     """Clamped, with a lateral spring k at its tip: tan u = u (1 - P / k L), u = L sqrt(P / EI)."""
     k = 3 * EI / L**3
@@ -203,6 +204,7 @@ def test_a_magnetised_beam_is_the_elastica():
     assert end[0] > 1.0  # far from straight
 
 
+@pytest.mark.slow
 def test_a_spinning_bar_stretches():
     """EA (r' - 1) is the pull, so r'' = -rho omega^2 / E r: r = sin(b X) / (b cos(b L))."""
     omega = 40.0
@@ -215,6 +217,7 @@ def test_a_spinning_bar_stretches():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "size"), [("spring", 1.0), ("dipole", 0.3), ("payload", 1.0)])
 def test_the_shape_is_that_under_the_dead_wrench_of_the_load(name, size):
     load = LOADS[name].scaled(jnp.asarray(size))
@@ -239,6 +242,7 @@ def test_all_models_agree(everything):
     np.testing.assert_allclose(everything.tip, fine.tip, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_tangents_are_the_derivative_of_the_reaction(everything):
     random = np.random.default_rng(1)
     change = tuple(

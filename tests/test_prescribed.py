@@ -40,6 +40,7 @@ def basis(request):
     return BASES[request.param]
 
 
+@pytest.mark.slow
 def test_B_is_the_transposed_derivative_of_the_thread_lengths(basis):
     """B(q)^T = d l / d q, with the lengths summed on another rule: 400 Simpson panels on each
     smooth piece."""
@@ -138,6 +139,7 @@ def strain_dependent_basis(scene, eq):
     return matrix
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case",
     [
@@ -217,6 +219,7 @@ def test_pcs_breaks_the_quadrature_at_its_sections():
     )
 
 
+@pytest.mark.slow
 def test_precision_follows_the_inputs(dtype):
     model = vsr.Prescribed(paper.basis("B1"))
     reference = paper.reference("B1")[0]

@@ -78,6 +78,7 @@ def solved():
     return vsr.solve(vsr.Scene(scene.rod, threads), INPUTS[jnp.array([0, 2])], model=MODEL)
 
 
+@pytest.mark.slow
 def test_a_summary_is_what_the_attributes_are(solved):
     eq, X = solved, jnp.array([0.0, 0.1, 0.2, 0.3])
     found = eq.summary(X, ("tip", "lengths", "stability"))
@@ -118,6 +119,7 @@ def test_every_entry_says_what_it_is():
         assert len(entry.description) > 10
 
 
+@pytest.mark.slow
 def test_a_new_quantity_is_one_entry(solved):
     eq = solved
     try:
@@ -146,6 +148,7 @@ def test_a_quantity_of_another_names_one_along_the_arm():
     assert "<lambda>" not in QUANTITIES
 
 
+@pytest.mark.slow
 def test_a_failed_solve_has_no_energy(solved):
     eq = vsr.solve(solved.scene, [1e300, 1.0], model=MODEL)
     assert np.isnan(eq.energy).all()

@@ -52,6 +52,7 @@ def exact(draws):
     return np.asarray(tip)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("order", "steps", "largest"), [(2, 32, 0.05), (4, 16, 0.06), (6, 8, 0.05), (6, 32, 0.02)]
 )
@@ -68,6 +69,7 @@ def test_what_converges_is_resolved(order, steps, largest, draws, exact):
         assert np.median(draws[1][~kept]) > 2 * np.median(draws[1][kept])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [2, 4, 6])
 def test_no_choice_of_nodes_hides_a_wave(order):
     """With a whole turn from node to node, or nearly, the strain looks slow."""
@@ -78,11 +80,13 @@ def test_no_choice_of_nodes_hides_a_wave(order):
     assert np.all(np.isnan(tip))
 
 
+@pytest.mark.slow
 def test_a_weak_wave_does_not_matter():
     _, status = tip_of(6, 16)(np.array([1.0]), np.array([16.0]), np.array([[0.01, 0.0]]))
     assert status[0] == vsr.Status.CONVERGED
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "model", [vsr.Prescribed(vsr.Basis.uniform(vsr.Legendre(2)), steps=4), vsr.Continuum()]
 )

@@ -51,6 +51,7 @@ def stiff(young, loads=(), actuators=TENDONS):
     )
 
 
+@pytest.mark.slow
 def test_a_tool_exerts_its_wrench_at_the_end_of_the_arm():
     """Gravity and a force on a tool are a force and a moment at its start; the tendon through it
     pulls there with the same force."""
@@ -87,6 +88,7 @@ def test_parts_beside_a_piece_bend_as_if_alone():
 LOADS = {"none": (), "gravity": GRAVITY, "followers": FOLLOWERS, "spring": SPRING}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "loads",
     [
@@ -114,11 +116,13 @@ def test_stiff_material_comes_close_as_its_compliance_does(loads):
     np.testing.assert_allclose(off[1][-1], 0, atol=1e-4 * abs(exact[-1]))
 
 
+@pytest.mark.slow
 def test_rigid_pieces_take_no_more_steps_than_stiff_ones():
     near = vsr.solve(stiff(1e9, FOLLOWERS), INPUTS, model=MODEL)
     assert int(vsr.solve(scene(FOLLOWERS), INPUTS, model=MODEL).steps) <= int(near.steps)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loads", [(), SPRING], ids=["bare", "spring"])
 def test_the_strain_is_that_at_rest_to_the_last_bit(loads, dtype):
     bow = (0.3, 2.0, 0.0, 1.02, 0.0, 0.01)
@@ -138,6 +142,7 @@ LENGTHS = [vsr.Tendon(vsr.Helix(0.006, angle=1.0), control="length", stiffness=3
 RUBBING = [vsr.Tendon(vsr.Helix(0.006, angle=1.0), friction=0.3), TENDONS[1]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("actuators", "loads", "inputs"),
     [
@@ -197,6 +202,7 @@ def test_derivatives(loads):
     assert np.abs(forward[..., 0]).max() > 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("force", [-20.0, 20.0], ids=["pull", "push"])
 def test_the_margin_leaves_rigid_pieces_out(force):
     """Threads in all directions stiffen every section that bends, or soften it; a rigid one, whose
@@ -213,6 +219,7 @@ def test_the_margin_leaves_rigid_pieces_out(force):
     np.testing.assert_allclose(held.condition, free.condition, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_compliance_is_that_of_a_small_wrench():
     eq = vsr.solve(scene(), INPUTS, model=MODEL)
 
@@ -224,6 +231,7 @@ def test_compliance_is_that_of_a_small_wrench():
     np.testing.assert_allclose(vsr.compliance(eq)[3:, 5], change, rtol=1e-5, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_energy_is_stationary_with_the_tension():
     """The derivative of the potential by a given tension is the length of its path."""
 
@@ -236,6 +244,7 @@ def test_energy_is_stationary_with_the_tension():
     np.testing.assert_allclose(slope, eq.lengths[0], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_branch_leads_to_the_solution():
     def path(s):
         return s * INPUTS
@@ -247,6 +256,7 @@ def test_a_branch_leads_to_the_solution():
     np.testing.assert_allclose(last.tip, exact.tip, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [*(pytest.param(n, marks=pytest.mark.slow) for n in (2, 4)), 6])
 def test_jumps_of_the_curvature_are_no_lack_of_steps(order):
     """Discs along an arm: the strain between them is exact without loads, and with gravity the
@@ -277,6 +287,7 @@ BARE_OR_HEAVY = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loads", BARE_OR_HEAVY)
 def test_a_basis_counts_beside_the_pieces(loads):
     """Smooth on the part that bends, so that a higher degree converges fast."""
@@ -296,6 +307,7 @@ def test_a_basis_counts_beside_the_pieces(loads):
     np.testing.assert_array_equal(fine.strain(0.33), [0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loads", BARE_OR_HEAVY)
 def test_a_section_of_a_basis_may_be_a_rigid_piece(loads):
     """Its coordinates are zero, and the others are those of an arm with stiff material there."""

@@ -15,6 +15,7 @@ def path(routing):
     return jax.vmap(routing.path)(X)
 
 
+@pytest.mark.slow
 def test_linear():
     p = path(vsr.Linear(0.001, 0.002, 0.003, -0.004))
     np.testing.assert_allclose(p.y, 0.001 + 0.003 * X)
@@ -49,6 +50,7 @@ def test_polynomial_takes_rising_powers():
     np.testing.assert_allclose(p.slope_y, 0.01 - 0.04 * X, rtol=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("points", [2, 3, 4, 7])
 def test_spline_is_scipys(points):
     rng = np.random.default_rng(points)

@@ -52,6 +52,7 @@ def test_a_scene_without_actuators_takes_no_inputs():
         vsr.solve(vsr.Scene(ARM), [1.0])
 
 
+@pytest.mark.slow
 def test_traced_inputs_get_a_status_instead():
     def status(inputs):
         return vsr.solve(SCENE, inputs).status
@@ -63,6 +64,7 @@ def test_traced_inputs_get_a_status_instead():
     )
 
 
+@pytest.mark.slow
 def test_throw_raises_with_the_status_in_words():
     with pytest.raises(vsr.SolveError, match="collapsed"):
         vsr.solve(SCENE, [1e4, 0.0, 0.0], throw=True)
@@ -201,6 +203,7 @@ def bent():
     return vsr.solve(BENT, [1.0], model=STEPS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "X", [0.7, -0.1, [0.1, 0.7], np.nan], ids=["beyond", "before", "one of two", "nan"]
 )
@@ -228,6 +231,7 @@ def test_places_off_a_thread_are_refused(bent, index, X, message):
         bent.thread(index, X)
 
 
+@pytest.mark.slow
 def test_single_precision_may_round_a_place_off_the_arm(bent):
     single = vsr.solve(BENT, np.float32([1.0]), model=STEPS)
     above = np.nextafter(np.float32(0.5), np.float32(1))
@@ -236,6 +240,7 @@ def test_single_precision_may_round_a_place_off_the_arm(bent):
     np.testing.assert_array_equal(bent.thread(0, [0.3 + 4e-7, 0.1]), bent.thread(0, [0.3, 0.1]))
 
 
+@pytest.mark.slow
 def test_discs_may_guide_threads_outside_the_section():
     arm = vsr.Rod(0.4, vsr.Circular(0.0007), vsr.Material(54e9, poisson=0.3), guide_radius=0.012)
     eq = vsr.solve(vsr.Scene(arm, [vsr.Tendon(vsr.Parallel(0.01, 0.0))]), [2.0])
@@ -254,6 +259,7 @@ def test_no_guide_radius_is_advised_to_a_rod_that_has_one():
         vsr.Scene(vsr.Rod(0.4, wire, steel, guide_radius=0.008), [thread])
 
 
+@pytest.mark.slow
 def test_base_and_rest_strain_place_the_arm_at_rest():
     base = se3.exp(jnp.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0]))
     rest = (0.0, 0.0, 4.0, 1.0, 0.0, 0.0)
@@ -264,6 +270,7 @@ def test_base_and_rest_strain_place_the_arm_at_rest():
     np.testing.assert_allclose(eq.tip, base @ se3.exp(0.5 * jnp.asarray(rest)), atol=1e-12)
 
 
+@pytest.mark.slow
 def test_rest_strain_may_be_a_function_of_X():
     arm = vsr.Rod(
         0.5,
@@ -276,6 +283,7 @@ def test_rest_strain_may_be_a_function_of_X():
     np.testing.assert_allclose(turn, 8 * 0.5**2 / 2, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_scene_without_actuators_is_at_rest():
     eq = vsr.solve(vsr.Scene(ARM, []), [])
     assert bool(eq.converged)

@@ -103,6 +103,7 @@ def full_scene() -> vsr.Scene:
     return vsr.Scene(rod, actuators, loads, free_strains=free, obstacles=obstacles)
 
 
+@pytest.mark.slow
 def test_every_class_comes_back_to_the_last_bit():
     scene = full_scene()
     text = to_toml(scene, [1.0, -0.001, 0.5, 1e4, 2e4], title='A "test"\nof \\ all')

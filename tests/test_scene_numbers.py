@@ -107,6 +107,7 @@ def test_a_replaced_number_keeps_its_precision(scene):
     assert small.rod.length.dtype == jnp.float32
 
 
+@pytest.mark.slow
 def test_transforms_go_through_replace(helix):
     def height(radius):
         scene = helix.replace("actuators[0].routing.radius", radius)

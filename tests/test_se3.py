@@ -55,6 +55,7 @@ def computed_derivatives(omega, a, b, c):
     return se3.exp(omega), first(omega), second(omega), jax.jvp(second, (omega,), (c,))[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angle", ANGLES)
 def test_exp_and_three_derivatives_are_exact_to_rounding(angle, dtype):
     rng = np.random.default_rng(1)
@@ -72,6 +73,7 @@ def test_exp_and_three_derivatives_are_exact_to_rounding(angle, dtype):
             )
 
 
+@pytest.mark.slow
 def test_reverse_mode_agrees_with_forward_at_the_identity(dtype):
     omega = jnp.asarray([0, 0, 0, 1, 0, 0], dtype)
     np.testing.assert_allclose(
@@ -137,6 +139,7 @@ def test_rotation_vectors_are_those_of_the_exponential(angle):
     )
 
 
+@pytest.mark.slow
 def test_rotation_vectors_have_derivatives_up_to_half_a_turn():
     for angle in (0.0, 0.5, 2.0, 2.2, 3.1, 3.14):
         at = jnp.array([0.48, 0.6, 0.64]) * angle

@@ -184,6 +184,7 @@ def test_the_arrays_of_a_module_that_is_a_profile_are_differentiated_and_batched
     )
 
 
+@pytest.mark.slow
 def test_what_a_function_closes_over_is_differentiated_and_batched():
     def tip(rate, offset):
         radius = vsr.FunctionProfile(lambda x: 0.01 - rate * x)

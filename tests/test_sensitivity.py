@@ -48,6 +48,7 @@ def motion(ahead, behind, step):
     return turn, (ahead[:3, 3] - behind[:3, 3]) / (2 * step)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [
@@ -90,6 +91,7 @@ def test_the_printed_table(table):
         table["rod.lenght"]
 
 
+@pytest.mark.slow
 def test_compliance_of_a_straight_beam_is_exact():
     """Timoshenko cantilever: L^3 / 3EI + L / kGA in bending, L / EA in tension, L / GJ in torsion,
     L^2 / 2EI coupling."""
@@ -107,6 +109,7 @@ def test_compliance_of_a_straight_beam_is_exact():
     np.testing.assert_allclose(C, expected, atol=1e-12 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_compliance_against_differences_of_solves(eq):
     """The quadrature along a bent arm against solves under a wrench, an independent algorithm."""
     C = vsr.compliance(eq)
@@ -154,6 +157,7 @@ class Approximate(SteppedModel):
         return self.inner.node_strain(scene, state)
 
 
+@pytest.mark.slow
 def test_compliance_of_a_third_party_model_is_the_derivative_of_its_solve(eq):
     """Its sections are not balanced, so the integral of their compliances is a different matrix."""
     found = vsr.solve(eq.scene, eq.inputs, model=Approximate())

@@ -28,6 +28,7 @@ def by_einsum(a, b):
     return jnp.einsum("nk...,km...->nm...", a, b)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("places", PLACES.values(), ids=PLACES)
 @pytest.mark.parametrize("columns", [1, 4])
 def test_values_and_derivatives_of_both_modes_are_those_of_einsum(places, columns):
@@ -42,6 +43,7 @@ def test_values_and_derivatives_of_both_modes_are_those_of_einsum(places, column
         np.testing.assert_allclose(one, other, rtol=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axes", [(0, None), (None, 0), (2, 1), (0, 3)])
 def test_a_batch_of_either_factor_is_the_loop(axes):
     a, b = (
@@ -68,6 +70,7 @@ def test_a_derivative_in_reverse_mode_is_a_product_each():
     assert [e.primitive.name for e in back.eqns] == ["small_product"] * 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("places", PLACES.values(), ids=PLACES)
 def test_vector_products_and_their_derivatives_are_those_of_numpy(places):
     a, b = (drawn(i, 3, *shape) for i, shape in enumerate(places))

@@ -126,6 +126,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [
@@ -205,6 +206,7 @@ def test_second_derivatives_are_those_of_differences(slopes):
     np.testing.assert_allclose(found, expected, rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_side_by_side_each_is_what_it_is_alone(slopes):
     """One that is not a number changes no other."""
     p = np.concatenate([[POINT, [0.5, 1.0, 1.0], [np.nan, 1.0, 1.0]], np.ones((10, 3))])

@@ -31,6 +31,7 @@ def tip(scene, inputs, model):
     return vsr.solve(scene, inputs, model=model).tip[:3, 3]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance", [1e-3, 1e-6])
 def test_a_plan_meets_its_tolerance_between_its_samples(plans, tolerance):
     chosen = plans[tolerance]
@@ -97,6 +98,7 @@ def test_a_helix_of_fifty_turns_gets_steps_enough():
     assert float(jnp.linalg.norm(eq.tip[:3, 3] - tip(scene, inputs, FINE))) <= 1e-5
 
 
+@pytest.mark.slow
 def test_a_straight_arm_takes_one_step():
     assert vsr.solve(paper.scene("A1"), [-5.0], tolerance=1e-9).model.steps == 1
 

@@ -62,6 +62,7 @@ def test_chunks_change_no_bit(expected):
     assert repr(result) == "Sweep(23 converged; tip (23, 4, 4))"
 
 
+@pytest.mark.slow
 def test_cores_change_no_bit(monkeypatch):
     monkeypatch.setattr(sweep_program, "BATCH_SIZE", 4)
     tips = []
@@ -96,6 +97,7 @@ def test_a_bad_sample_changes_no_other(expected):
     ]
 
 
+@pytest.mark.slow
 def test_outputs_by_name_and_by_function(expected):
     named = vsr.sweep(
         arm(0.006), inputs, outputs=("lengths", "stability"), model=MODEL, progress=False
@@ -131,6 +133,7 @@ def test_single_precision():
     assert result.converged.all()
 
 
+@pytest.mark.slow
 def test_fewer_samples_side_by_side_where_memory_is_short(expected):
     result = vsr.sweep(arm(0.006), inputs, model=MODEL, memory=400_000, progress=False)
     np.testing.assert_allclose(result["tip"], expected, rtol=1e-14, atol=1e-16)
@@ -196,6 +199,7 @@ DAMAGE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chunk", [2, 5])
 @pytest.mark.parametrize("name", ["tip", "status", "inputs"])
 @pytest.mark.parametrize("damage", DAMAGE)
@@ -471,6 +475,7 @@ def finished(process):
     assert process.returncode == 0, said
 
 
+@pytest.mark.slow
 @simulated
 def test_eight_devices_give_the_same(tmp_path, expected):
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=8"
@@ -484,6 +489,7 @@ np.save(os.environ["TO"], vsr.sweep(arm(0.006), inputs, model=model, progress=Fa
     )  # another program, rounded otherwise
 
 
+@pytest.mark.slow
 @simulated
 def test_two_processes_give_the_same_in_memory_and_on_disk(tmp_path, expected):
     with socket.socket() as free:
@@ -516,6 +522,7 @@ assert found == [f"tip[{10 + 5 * number}:{15 + 5 * number}]"]
     np.testing.assert_array_equal(kept["tip"][:], expected)
 
 
+@pytest.mark.slow
 def test_a_killed_sweep_goes_on_with_the_same_result(tmp_path):
     zarr = pytest.importorskip("zarr")
     code = (

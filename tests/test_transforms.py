@@ -102,7 +102,13 @@ def test_second_derivatives(helix):
     np.testing.assert_allclose(jax.jit(jax.grad(jax.grad(height)))(at), second, rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[] if name == "strain-dependent" else pytest.mark.slow)
+        for name in MODELS
+    ],
+)
 def test_vmap_is_the_loop(name, helix):
     taus = jnp.array([[-15.0], [0.0], [8.0]])
 
@@ -114,6 +120,7 @@ def test_vmap_is_the_loop(name, helix):
     )
 
 
+@pytest.mark.slow
 def test_a_batch_in_parts_is_the_loop(helix):
     model = vsr.StrainDependent(1)
     taus = jnp.linspace(-15.0, 5.0, 1030)[:, None]  # more than are solved together
@@ -130,6 +137,7 @@ def test_a_batch_in_parts_is_the_loop(helix):
     np.testing.assert_allclose(forward, loop[1][1], atol=1e-13)
 
 
+@pytest.mark.slow
 def test_vmap_over_designs(helix):
     radii = jnp.array([0.003, 0.004, 0.005])
 
@@ -142,6 +150,7 @@ def test_vmap_over_designs(helix):
     )
 
 
+@pytest.mark.slow
 def test_a_batch_of_equilibria_gives_its_results_under_vmap(helix):
     eqs = jax.vmap(lambda tau: vsr.solve(helix, tau))(jnp.array([[-15.0], [-5.0]]))
     assert "batch=(2,)" in repr(eqs)
@@ -164,6 +173,7 @@ def test_a_scene_may_be_built_under_jit():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "quantity",
     [
@@ -236,6 +246,7 @@ STEPS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "precision"),
     [

@@ -57,6 +57,7 @@ def shuffled(positions):
     return np.take_along_axis(positions, orders[..., None], axis=1), orders
 
 
+@pytest.mark.slow
 def test_shuffled_markers_give_the_fit_of_labelled_ones(labelled, shuffled, positions):
     """The start is so far from the arm that the nearest positions are others."""
     gaps = np.linalg.norm(places(arm(), INPUTS)[:, :, None] - positions[:, None], axis=3)

@@ -80,6 +80,7 @@ def expected(session):
     return vsr.solve(session.scene.replace(numbers), inputs, model=MODEL)
 
 
+@pytest.mark.slow
 def test_an_answer_is_what_solve_finds(session):
     session.move({"inputs[0]": 3.0, "rod.length": 0.32, "rod.material.young": 8e5})
     answer = session.move({"inputs[1]": 0.4})
@@ -153,6 +154,7 @@ def test_a_collapsed_arm_says_so_and_keeps_its_last_shape():
     np.testing.assert_allclose(again.shape.tip, expected(session).tip[:3, 3], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_without_an_equilibrium_at_the_start_the_arm_at_rest_is_shown():
     session = Session(loaded(), [1e4, 0.0, 0.0], bounds=(0.0, 1e5), model=MODEL)
     answer = session.solve()
@@ -180,12 +182,14 @@ def test_the_saved_scene_is_the_one_that_is_shown(session):
     np.testing.assert_allclose(eq.tip[:3, 3], session.answer.shape.tip, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_single_precision_stays_single():
     session = Session(bare().astype("float32"), jnp.ones(2, "float32"), model=MODEL)
     assert session.solve().shape.equilibrium.tip.dtype == np.float32
     assert session.move({"inputs[0]": 1.5}).shape.equilibrium.tip.dtype == np.float32
 
 
+@pytest.mark.slow
 def test_default_ranges_of_inputs():
     chamber = vsr.Chamber(_along(0.006, 0.0), 2e-5)
     length = vsr.Tendon(_along(0.0, 0.006), control="length")
@@ -263,6 +267,7 @@ def test_sliders_are_shown_with_a_prefix():
     assert radius.in_si(0.7) == 0.0007
 
 
+@pytest.mark.slow
 def test_strain_and_stress_of_the_wall_in_closed_form():
     r"""Moment M: $\epsilon = M z / EI$; torque: $\sqrt 3 M r / J$; force along the arm: F / A."""
     rod = vsr.Rod(LENGTH, vsr.Circular(RADIUS), SOFT)
@@ -302,6 +307,7 @@ def test_the_tube_is_closed_and_its_faces_look_outward():
     assert sum(areas) == pytest.approx(body.area)
 
 
+@pytest.mark.slow
 def test_the_wall_of_a_rigid_piece_is_apart():
     rod = bare().rod
     held = vsr.Rod(rod.length, rod.section, rod.material, rigid=vsr.RigidPiece(0.153))
@@ -322,6 +328,7 @@ def test_the_wall_of_a_rigid_piece_is_apart():
     assert not np.any(shape.strain[first:])
 
 
+@pytest.mark.slow
 def test_threads_end_where_they_are_tied_and_slack_ones_are_dashed():
     scene = vsr.Scene(
         bare().rod,

@@ -41,6 +41,7 @@ def agree(warm, cold):
     np.testing.assert_allclose(warm.tip, cold.tip, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_a_small_change_takes_fewer_steps(scene, near):
     moved = jnp.array([3.03, 1.515])
     warm, cold = solved(scene, moved, near), solved(scene, moved)
@@ -48,6 +49,7 @@ def test_a_small_change_takes_fewer_steps(scene, near):
     agree(warm, cold)
 
 
+@pytest.mark.slow
 def test_a_soft_arm_in_its_basin_takes_less_than_half_of_the_steps():
     paper_arm = paper.scene("B1")
     material = vsr.Material(5.93e5, shear=2.0e5, density=1080.0)
