@@ -9,7 +9,10 @@ import os
 import pathlib
 import re
 import shutil
+import signal
 import socket
+import subprocess
+import sys
 import time
 
 import numpy as np
@@ -30,6 +33,7 @@ MODEL = vsr.StrainDependent(6)
 LENGTH, ANGLES = 0.3, 24
 INPUTS = [3.0, 0.5, 1.5]
 FORCE = "loads[0].force[2]"
+PILLAR = str(pathlib.Path(__file__).parents[1] / "notebooks" / "scenes" / "pillar.toml")
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
@@ -138,6 +142,21 @@ def test_obstacles_follow_their_numbers(scene):
         page.move({name: 0.04}).wait()
         away = np.linalg.norm(node(page, "/obstacles/1").vertices - ball.centre, axis=1)
         np.testing.assert_allclose(away, 0.04, atol=1e-6)
+
+
+def test_ctrl_c_ends_the_command_at_once_while_it_compiles():
+    """XLA aborts if the interpreter ends below a thread that compiles."""
+    code = "import sys; from vsr_jax.cli.main import main; sys.exit(main())"
+    command = [sys.executable, "-c", code, "view", PILLAR, "--no-browser"]
+    command += ["--no-cache", "--port", str(free_port())]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        assert "Ctrl-C" in process.stderr.readline()
+        start = time.monotonic()
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate()
+    assert (process.returncode, said) == (0, "")
+    assert time.monotonic() - start < 3
 
 
 class Browser:

@@ -495,6 +495,15 @@ def test_the_command_passes_its_arguments(tmp_path, monkeypatch):
     }
 
 
+def test_the_command_starts_at_rest_without_inputs(tmp_path, monkeypatch):
+    pytest.importorskip("viser")
+    path, called = tmp_path / "arm.toml", []
+    path.write_text(re.sub("inputs = .*", "", pathlib.Path(HELIX).read_text()))
+    monkeypatch.setattr("vsr_jax.viewer.page.view", lambda *given, **options: called.extend(given))
+    assert cli.main(["view", str(path)]) == 0
+    np.testing.assert_array_equal(called[1], [0.0])
+
+
 def test_errors_of_the_command_are_one_line(tmp_path, capsys):
     pytest.importorskip("viser")
     bad = tmp_path / "rows.csv"

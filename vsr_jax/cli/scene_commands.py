@@ -142,11 +142,17 @@ class SceneTask(NamedTuple):
     title: str
 
 
-def read_task(path: str, inputs: Sequence[float] | None, precision: str = "float64") -> SceneTask:
+def read_task(
+    path: str,
+    inputs: Sequence[float] | None,
+    precision: str = "float64",
+    *,
+    at_rest: bool = False,
+) -> SceneTask:
     """The task of a scene file, with the default model; warns about implausible numbers.
 
     **Arguments:** `path`: the file; `inputs`: from the command line, None for those of the file;
-    `precision`: of all numbers.
+    `precision`: of all numbers; `at_rest`: whether the inputs are zeros where there are none.
 
     **Raises:** `ValueError` for an invalid file or invalid numbers.
     """
@@ -154,18 +160,20 @@ def read_task(path: str, inputs: Sequence[float] | None, precision: str = "float
     scene, stored, title = load(path)
     warn(warnings_of(scene))
     values = stored if inputs is None else inputs
-    if values is None and scene.actuators:
-        kinds = ", ".join(type(actuator).__name__ for actuator in scene.actuators)
-        raise ValueError(f"{path}: has no inputs, need --inputs, one number each for {kinds}")
-    return SceneTask(scene, jnp.asarray([] if values is None else values, precision), None, title)
+    if values is None:
+        if scene.actuators and not at_rest:
+            kinds = ", ".join(type(actuator).__name__ for actuator in scene.actuators)
+            raise ValueError(f"{path}: has no inputs, need --inputs, one number each for {kinds}")
+        values = [0.0] * len(scene.actuators)
+    return SceneTask(scene, jnp.asarray(values, precision), None, title)
 
 
-def task_of(options: argparse.Namespace) -> SceneTask:
-    """The task of the arguments that `add_scene` adds.
+def task_of(options: argparse.Namespace, *, at_rest: bool = False) -> SceneTask:
+    """The task of the arguments that `add_scene` adds; `at_rest` as of `read_task`.
 
     **Raises:** `ValueError` as `read_task`, and for a tolerance together with a model.
     """
-    task = read_task(options.scene, options.inputs, options.precision)
+    task = read_task(options.scene, options.inputs, options.precision, at_rest=at_rest)
     if options.tolerance is not None and (options.model, options.steps) != (None, None):
         raise ValueError(
             "--tolerance: got --model or --steps too, need one or the other: a tolerance sets both"

@@ -1,7 +1,10 @@
 """The command `vsr-jax view`: the live view of a scene file in the browser."""
 
 import argparse
-from collections.abc import Sequence
+import os
+import signal
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -30,7 +33,7 @@ def add_view(commands: Commands) -> None:
         example="vsr-jax view scene.toml --number rod.material.young --number rod.length 0.2 0.4",
         run=_view,
     )
-    add_scene(parser)
+    add_scene(parser, "those of the file, or zeros")
     add_bounds(parser, "twice the greatest input of the same kind")
     parser.add_argument(
         "--number",
@@ -64,28 +67,40 @@ def _view(options: argparse.Namespace) -> int:
 
     viewer_library()
     numbers = numbers_of(options.number)
-    task = task_of(options)
+    task = task_of(options, at_rest=True)
     model = task.model
     if options.tolerance is not None:
         model = solve(task.scene, task.inputs, tolerance=options.tolerance).model
     ends = None
     if options.low is not None or options.high is not None:
         ends = bounds(options.low, options.high, 2 * np.asarray(task.inputs))
-    view(
-        task.scene,
-        task.inputs,
-        numbers=numbers,
-        bounds=ends,
-        model=model,
-        play=None if options.play is None else rows_of(options.play),
-        title=task.title,
-        theme=options.theme,
-        host=options.host,
-        port=options.port,
-        browser=not options.no_browser,
-        block=True,
-    )
+    with _interrupts_end():
+        view(
+            task.scene,
+            task.inputs,
+            numbers=numbers,
+            bounds=ends,
+            model=model,
+            play=None if options.play is None else rows_of(options.play),
+            title=task.title,
+            theme=options.theme,
+            host=options.host,
+            port=options.port,
+            browser=not options.no_browser,
+            block=True,
+        )
     return DONE
+
+
+@contextmanager
+def _interrupts_end() -> Iterator[None]:
+    """Context in which Ctrl-C ends the process at once: XLA aborts if the interpreter ends while a
+    thread compiles, which takes too long to wait for."""
+    before = signal.signal(signal.SIGINT, lambda *_: os._exit(DONE))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def numbers_of(given: Sequence[Sequence[str]]) -> dict[str, Any]:
