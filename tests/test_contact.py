@@ -13,7 +13,9 @@ import vsr_jax as vsr
 from vsr_jax.arm.rod import STRAINS
 from vsr_jax.files.scene_file import parse_scene, to_toml
 from vsr_jax.mechanics.nearest import lying
-from vsr_jax.mechanics.touch import _handed
+from vsr_jax.mechanics.touch import Touch, _handed
+from vsr_jax.solution.bearing import _at_ends
+from vsr_jax.viz.annotate import rows_of
 
 L = 0.2
 NO_INPUTS = jnp.zeros(0)
@@ -225,6 +227,32 @@ def test_a_plane_may_touch_the_ends_of_steps_too(pressed, first):
     places = eq.position(contacts.X[plane, 1::2])
     np.testing.assert_allclose(contacts.position[plane, 1::2], places, atol=1e-9)
     np.testing.assert_allclose(contacts.gap[plane], contacts.position[plane, :, 2] + 0.195)
+
+
+def test_a_contact_at_the_tip_has_one_row():
+    """The nearest point of the last step is its end: one contact, with the force of the balance,
+    in the data and in figures."""
+    floor = vsr.Plane((0, 0, 1), (0, 0, -0.03))
+    eq = solved(PRESS, obstacles=floor, model=vsr.StrainDependent(4))
+    force = np.asarray(eq.contacts.force[0])
+    np.testing.assert_allclose(eq.contacts.X[0, force > 1e-9], [L])
+    (row,) = [row for row in rows_of(eq) if row.name == "contact with plane"]
+    np.testing.assert_allclose(row.vectors, [[0, 0, force.sum()]], atol=1e-12)
+    base = eq.reaction(jnp.zeros(1))[0, 3:]
+    np.testing.assert_allclose(base, np.array([0, 0.005, -0.03 + force.sum()]), atol=1e-9)
+
+
+def test_forces_at_joints_of_steps_are_added():
+    """Nearest points at an end of a step hand their forces to it, of the step before too, but not
+    to one that is not there."""
+    touch = Touch(*[None] * len(Touch._fields))._replace(
+        sigma=jnp.array([[1.0, 0.0, 0.5, 0.0, 1.0], [1.0, 0.0, 0.5, 0.0, 1.0]]),
+        force=jnp.arange(10.0).reshape(2, 5),
+    )
+    there = jnp.array([[True, True, False, True, True]])
+    near, end = jnp.moveaxis(_at_ends(touch, np.array([1]), there)[0], -1, 0)
+    np.testing.assert_array_equal(near, [0, 0, 2, 3, 0])
+    np.testing.assert_array_equal(end, [0 + 5 + 1, 6, 0, 8, 4 + 9])
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from ..mechanics.contact import Contacts
 from ..mechanics.coupling import ArmProblem
 from ..mechanics.held import Holds
 from ..mechanics.nearest import lying
-from ..mechanics.touch import Surroundings, Touch
+from ..mechanics.touch import Surroundings, Touch, received
 from ..numerics import lu
 from ..numerics.component import Vector
 from ..numerics.lanczos import Operator
@@ -28,7 +28,8 @@ from ..typing import DTypeLike
 class Contact(NamedTuple):
     """Contact of each obstacle with each step along the arm, where the gap is least, and in scenes
     with planes or tubes without friction with the end of each step too (of other obstacles, and
-    where a section is held, the same place once more, without force).
+    where a section is held, the same place once more, without force). Of places that coincide, as
+    at a tip, one has the force, so that the sum is that of all contacts.
 
     **Fields:** with the obstacles in the first axis and the places, one or two per step, in the
     second, the abscissa `X` [m]; `position` [m] of the axis in the world; `normal` of the obstacle;
@@ -66,7 +67,7 @@ def contacts_of(problem: ArmProblem, unknown: ArmUnknown) -> Contact:
     assert touch is not None
     assert around is not None
     friction = jnp.zeros_like(touch.normal) if touch.slip is None else touch.slip.force
-    which, pushes = _places(touch, around)
+    which, pushes, force = _places(touch, around, grid)
     steps = jnp.arange(len(grid.h))[:, None]
 
     def listed(x: Array) -> Array:
@@ -81,24 +82,37 @@ def contacts_of(problem: ArmProblem, unknown: ArmUnknown) -> Contact:
         vectors(touch.place),
         vectors(touch.normal),
         listed(touch.gap),
-        jnp.where(pushes, listed(touch.force), 0.0),
+        force,
         jnp.where(pushes[..., None], vectors(friction), 0.0),
     )
 
 
-def _places(touch: Touch, around: Surroundings) -> tuple[Array, Array]:
-    """The contacts of a step at its places (obstacles, steps, 1 or 2), and whether their forces are
-    those of the places (obstacles, places): an obstacle without a contact at the end of a step has
-    the nearest one twice."""
+def _places(touch: Touch, around: Surroundings, grid: Grid) -> tuple[Array, Array, Array]:
+    """The contacts of a step at its places (obstacles, steps, 1 or 2), whether they are those of
+    the places (obstacles, places), and their forces there: an obstacle without a contact at the end
+    of a step has the nearest one twice."""
     count, ends = len(around.obstacles), lying(around.obstacles)
     first = jnp.broadcast_to(jnp.arange(count)[:, None], (count, touch.gap.shape[1]))
     if not ends:
-        return first[..., None], jnp.ones_like(first, bool)
+        return first[..., None], jnp.ones_like(first, bool), touch.force
     second = np.array([count + ends.index(i) if i in ends else i for i in range(count)])
     lifted = jnp.broadcast_to(around.lift, touch.gap.shape)[second] > 0
     there = ~lifted & (second >= count)[:, None]
     which = jnp.stack([first, jnp.where(there, second[:, None], first)], -1)
-    return which, jnp.stack([jnp.ones_like(there), there], -1).reshape(count, -1)
+    pushes = jnp.stack([jnp.ones_like(there), there], -1).reshape(count, -1)
+    force = _at_ends(touch, second, there & (grid.h > 0))
+    return which, pushes, force.reshape(count, -1)
+
+
+def _at_ends(touch: Touch, second: np.ndarray, there: Array) -> Array:
+    """Forces of nearest points and of ends of steps (obstacles, steps, 2), with those of nearest
+    points that are ends at the ends."""
+    sigma, near = touch.sigma[: len(second)], touch.force[: len(second)]
+    before = received(jnp.ones_like(near), there.astype(near.dtype))
+    at_end, at_start = there & (sigma >= 1), (before > 0) & (sigma <= 0)
+    end = jnp.where(there, touch.force[second], 0.0) + jnp.where(at_end, near, 0.0)
+    end += received(-at_start.astype(near.dtype), near)
+    return jnp.stack([jnp.where(at_end | at_start, 0.0, near), end], -1)
 
 
 class Supported(eqx.Module):
