@@ -83,10 +83,10 @@ def test_tensions_have_signed_colours_and_slack_tendons_are_dashed():
         [
             vsr.Tendon(vsr.Parallel(0.005, 0.0)),
             vsr.Tendon(vsr.Parallel(0.0, 0.005)),
-            vsr.Chamber(vsr.Parallel(0.0, -0.005), area=2e-5),
+            vsr.Thread(vsr.Parallel(0.0, -0.005)),
         ],
     )
-    ax = plot.arm(vsr.solve(scene, [2.0, 0.0, 5e4]))
+    ax = plot.arm(vsr.solve(scene, [2.0, 0.0, 1.0]))
     pulled, slack, pushing, axis = ax.lines
     assert mpl.colors.same_color(pulled.get_color(), TENSION(1.0))
     assert mpl.colors.same_color(pushing.get_color(), TENSION(0.25))  # half the greatest, pushing
@@ -97,6 +97,21 @@ def test_tensions_have_signed_colours_and_slack_tendons_are_dashed():
     assert [bar.get_ylabel() for bar in bars] == ["thread tension [N]"]
     assert bars[0].get_ylim() == (-2.0, 2.0)
     assert "slack tendon" in [text.get_text() for text in ax.get_legend().get_texts()]
+    plt.close("all")
+
+
+def test_chambers_have_the_colour_of_their_pressure_on_a_bar_of_their_own():
+    at = vsr.Parallel(0.0, 0.005)
+    wide, narrow = (vsr.Chamber(at, area=area) for area in (2e-5, 1e-5))
+    rod = vsr.Rod(0.3, vsr.Circular(0.01), vsr.Material(8e5, poisson=0.45))
+    scene = vsr.Scene(rod, [wide, vsr.Tendon(at), narrow])
+    ax = plot.arm(vsr.solve(scene, [2e4, 2.0, 5e4]))
+    low, pulled, high, _ = ax.lines
+    assert mpl.colors.same_color(high.get_color(), TENSION(0.0))
+    assert mpl.colors.same_color(low.get_color(), TENSION.reversed()(0.7))
+    assert mpl.colors.same_color(pulled.get_color(), TENSION(1.0))
+    bars = {x.get_ylabel(): x.get_ylim() for x in ax.figure.axes if x is not ax}
+    assert bars == {"thread tension [N]": (0, 2), "chamber pressure [kPa]": (0, 50)}
     plt.close("all")
 
 

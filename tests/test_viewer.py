@@ -374,6 +374,24 @@ def test_scales_of_colours_are_round_and_follow_slowly():
     assert set(tension.levels(np.zeros(2))) == {coloring.BANDS // 2}
 
 
+def test_chambers_are_coloured_by_pressure_and_other_threads_by_tension():
+    at = vsr.Parallel(0.0, 0.005)
+    tendon, chamber = vsr.Tendon(at), vsr.Chamber(at, area=2e-5)
+    rod = vsr.Rod(LENGTH, vsr.Circular(RADIUS), SOFT)
+    for actuators, more in (
+        ([tendon], {"tension"}),
+        ([chamber], {"pressure"}),
+        ([tendon, chamber], {"tension", "pressure"}),
+        ([], set()),
+    ):
+        scene = vsr.Scene(rod, actuators)
+        assert set(coloring.colorings_of(scene)) == {"strain", "stress"} | more
+    pressure = coloring.Scale(coloring.COLORINGS["pressure"])
+    pressure.cover(np.array([np.nan, 4e4]))
+    assert "40 kPa pushes" in pressure.html()
+    assert np.argmax(pressure.colors()[-1]) == 2  # blue, as of a thread that pushes
+
+
 def test_a_sweep_is_solved_frame_by_frame(session):
     session.move({"inputs[0]": 1.0, "rod.length": 0.3})
     slider = session.sliders[0]

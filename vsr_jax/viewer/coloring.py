@@ -1,4 +1,5 @@
-"""What colours mean in the page: strain and stress of the wall, tension of the threads."""
+"""What colours mean in the page: strain and stress of the wall, tension and pressure of the
+threads."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -7,7 +8,8 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.colors import Colormap, to_hex
 
-from ..viz.style import TENSION
+from ..arm.scene import Scene
+from ..viz.style import PRESSURE, TENSION
 from .description import Shape
 from .sliders import prefixed
 
@@ -23,33 +25,57 @@ _ROUND = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
 class Coloring(NamedTuple):
     """A quantity that is shown in colour.
 
-    **Fields:** its name and its `unit`; the `values` at the wall, or of the threads; `signed`,
-    whether zero is in the middle of the scale; `ends`, what its lowest and its highest value mean.
+    **Fields:** its name and its `unit`; the `values` at the wall, or where it is `of_threads` those
+    of each thread, NaN without; the `map` of colours; `signed`, whether zero is in the middle of
+    the scale; `ends`, what its lowest and its highest value mean.
     """
 
     label: str
     unit: str
     values: Callable[[Shape], np.ndarray]
-    signed: bool
+    map: Colormap
+    signed: bool = True
     ends: tuple[str, str] = ("", "")
-
-    @property
-    def map(self) -> Colormap:
-        """Its colours."""
-        return TENSION if self.signed else mpl.colormaps[mpl.rcParamsDefault["image.cmap"]]
+    of_threads: bool = False
 
 
-def _tension(shape: Shape) -> np.ndarray:
-    tension = shape.body.tension
-    return np.zeros(0) if tension is None else tension
+def _known(values: np.ndarray | None) -> np.ndarray:
+    return np.zeros(0) if values is None else values
 
 
 COLORINGS = {
-    "strain": Coloring("strain along the arm", "", lambda s: s.strain, True, ("short", "long")),
-    "stress": Coloring("von Mises stress", "Pa", lambda s: s.stress, False),
-    "tension": Coloring("thread tension", "N", _tension, True, ("pushes", "pulls")),
+    "strain": Coloring(
+        "strain along the arm", "", lambda s: s.strain, TENSION, ends=("short", "long")
+    ),
+    "stress": Coloring(
+        "von Mises stress", "Pa", lambda s: s.stress, mpl.colormaps["viridis"], signed=False
+    ),
+    "tension": Coloring(
+        "thread tension",
+        "N",
+        lambda s: _known(s.body.tension),
+        TENSION,
+        ends=("pushes", "pulls"),
+        of_threads=True,
+    ),
+    "pressure": Coloring(
+        "chamber pressure",
+        "Pa",
+        lambda s: _known(s.body.pressure),
+        PRESSURE,
+        ends=("pulls", "pushes"),
+        of_threads=True,
+    ),
 }
 """The choices by name."""
+
+
+def colorings_of(scene: Scene) -> tuple[str, ...]:
+    """Names of the choices for a scene: pressure only with chambers, tension only with other
+    threads."""
+    inflated = [actuator.pressure_area is not None for actuator in scene.actuators]
+    there = {"tension": not all(inflated), "pressure": any(inflated)}
+    return tuple(name for name in COLORINGS if there.get(name, True))
 
 
 class Scale:
@@ -66,7 +92,7 @@ class Scale:
 
     def cover(self, values: np.ndarray) -> None:
         """Extends the scale to values, or shortens it where it is far too long."""
-        greatest = float(np.max(np.abs(values), initial=0.0))
+        greatest = float(np.nanmax(np.abs(values), initial=0.0))
         if greatest > self.high or greatest < _SHRINK * self.high:
             self.high = rounded_up(greatest)
 

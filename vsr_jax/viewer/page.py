@@ -18,6 +18,7 @@ from ..solution.equilibrium import Equilibrium
 from ..typing import VectorLike
 from ..validation import choice, instance
 from ..viz.style import Theme, settings
+from .coloring import colorings_of
 from .panel import Panel, status_html
 from .playback import Playable, Track, tracks_of
 from .player import Player
@@ -49,12 +50,12 @@ def view(
 ) -> "View":
     """A page in the browser in which an arm is turned by hand.
 
-    The wall of the arm is coloured by strain or stress, or its threads by their tension. Sliders
-    move the inputs and the chosen numbers of the scene; each answer starts from the last
-    equilibrium. Where there is none, the page says why and the last shape stays, dimmed. The tip
-    can be dragged: `reach` finds the inputs that follow with the least change. Sweeps, paths with
-    friction and designs are played frame by frame; the scene as it stands is saved as TOML, the
-    picture as PNG. Needs `pip install "vsr-jax[viewer]"`.
+    The wall of the arm is coloured by strain or stress, or its threads by their tension or
+    pressure. Sliders move the inputs and the chosen numbers of the scene; each answer starts from
+    the last equilibrium. Where there is none, the page says why and the last shape stays, dimmed.
+    The tip can be dragged: `reach` finds the inputs that follow with the least change. Sweeps,
+    paths with friction and designs are played frame by frame; the scene as it stands is saved as
+    TOML, the picture as PNG. Needs `pip install "vsr-jax[viewer]"`.
 
     **Arguments:**
     - `scene`: a scene, or an equilibrium, whose inputs and model are the defaults.
@@ -132,7 +133,12 @@ class View:
         self._stage.theme(theme)
         values = [session.value(slider) for slider in session.sliders]
         self._panel = Panel(
-            server.gui, session.sliders, values, [track.name for track in tracks], theme
+            server.gui,
+            session.sliders,
+            values,
+            colorings_of(session.scene),
+            [track.name for track in tracks],
+            theme,
         )
         self._tip = server.scene.add_transform_controls(
             "/tip",

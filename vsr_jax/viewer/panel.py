@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from .coloring import COLORINGS, Scale
+from .coloring import Scale
 from .description import Shape
 from .playback import SWEEPS
 from .session import Answer
@@ -25,6 +25,7 @@ class Panel:
     **Arguments:**
     - `gui`: that of a viser server.
     - `sliders`: with their `values`.
+    - `colorings`: names of the choices of colours.
     - `tracks`: names of what can be played besides the sweeps.
 
     **Fields:** the handles of the controls. Callbacks are attached by `on`, which leaves out
@@ -36,6 +37,7 @@ class Panel:
         gui: Any,
         sliders: Sequence[Slider],
         values: Sequence[float],
+        colorings: Sequence[str],
         tracks: Sequence[str],
         theme: str,
     ):
@@ -51,7 +53,7 @@ class Panel:
                         self.sliders[slider.name] = slider, _add(gui, slider, value)
         self.reset = gui.add_button("Reset")
         with gui.add_folder("Show"):
-            self.color = gui.add_dropdown("colour", tuple(COLORINGS), initial_value="strain")
+            self.color = gui.add_dropdown("colour", colorings, initial_value="strain")
             self.bar = gui.add_html("")
             self.loads = gui.add_html("")
             self.drag = gui.add_checkbox("drag the tip", bool(sliders) and sliders[0].of == INPUTS)

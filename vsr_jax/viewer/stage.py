@@ -31,9 +31,9 @@ _VIEW = np.array([0.46, -0.80, 0.37])
 _ANGLE, _DISTANCE, _ASIDE = 0.7, 1.9, 0.25
 """Angle of view [rad]; distance of the camera, and how far the controls at the right move what it
 looks at, in extents of the arm."""
-_OPACITY = {"strain": 0.8, "stress": 0.8, "tension": 0.4}
-_DIMMED, _DISC, _RIGID = 0.15, 0.25, 0.9
-"""Opacity of the wall of a shape that is no equilibrium, of discs, and of rigid pieces."""
+_WALL, _WINDOW, _DIMMED, _DISC, _RIGID = 0.8, 0.4, 0.15, 0.25, 0.9
+"""Opacity of the wall, of one around coloured threads, of one that is no equilibrium; of discs and
+rigid pieces."""
 _THREAD = 4.0
 """Width of threads [pixels]."""
 _THIN, _WITHIN = 0.012, 0.5
@@ -90,7 +90,7 @@ class Stage:
             with self._server.atomic():
                 self._draw_wall(shape, good)
                 self._draw_discs(body, good)
-                self._draw_threads(body, good)
+                self._draw_threads(shape, body, good)
                 self._draw_loads(shape, good)
                 self._draw_obstacles(shape.equilibrium.scene)
             self._server.flush()
@@ -102,10 +102,10 @@ class Stage:
         wall, held = bands(tube(rings), rigid.astype(int), 2)
         values = self.scale.coloring.values(shape)
         self.scale.cover(values)
-        plain = not good or self.scale.coloring is COLORINGS["tension"]
-        opacity = _OPACITY[_name(self.scale)] if good else _DIMMED
+        window = self.scale.coloring.of_threads
+        opacity = (_WINDOW if window else _WALL) if good else _DIMMED
         self._mesh("/arm/wall/rigid", held, self._gray(0.75), _RIGID if good else _DIMMED)
-        if plain:
+        if window or not good:
             self._mesh("/arm/wall/plain", wall, self._gray(0.5), opacity)
             parts = [Mesh(wall.vertices[:0], wall.triangles[:0])] * BANDS
         else:
@@ -119,12 +119,14 @@ class Stage:
         opacity = _DISC if good else _DIMMED
         self._mesh("/arm/discs", discs(body.discs), self._gray(0.5), opacity, side="double")
 
-    def _draw_threads(self, body: Body, good: bool) -> None:
+    def _draw_threads(self, shape: Shape, body: Body, good: bool) -> None:
         slack = np.zeros(len(body.samples.threads), bool) if body.slack is None else body.slack
         points, thread = segments(np.asarray(body.samples.threads), slack)
-        color = np.broadcast_to(self._gray(0.8 if good else 0.35), (len(slack), 3))
-        if good and self.scale.coloring is COLORINGS["tension"] and body.tension is not None:
-            color = self.scale.colors()[self.scale.levels(body.tension)]
+        color = np.tile(self._gray(0.8 if good else 0.35), (len(slack), 1))
+        if good and self.scale.coloring.of_threads:
+            values = self.scale.coloring.values(shape)
+            there = np.isfinite(values)
+            color[there] = self.scale.colors()[self.scale.levels(values[there])]
         colors = np.repeat(color[thread][:, None], 2, axis=1)
         self._lines("/arm/threads", points, colors, _THREAD)
 
@@ -282,10 +284,6 @@ def linear(colors: np.ndarray) -> np.ndarray:
     share = np.asarray(colors, float) / 255
     light = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
     return np.rint(255 * light).astype(np.uint8)
-
-
-def _name(scale: Scale) -> str:
-    return next(name for name, coloring in COLORINGS.items() if coloring is scale.coloring)
 
 
 def _bytes(color: ColorType) -> tuple[int, int, int]:

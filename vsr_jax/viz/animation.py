@@ -12,14 +12,14 @@ from matplotlib.lines import Line2D
 from ..solution.equilibrium import Equilibrium
 from ..solution.summary import Summary
 from ..typing import PathLike
-from .body import Body, body_of, draw_body
+from .body import Body, body_of, draw_body, thread_scales
 from .obstacles import draw_obstacles
 from .space import equal_scale, fit_height, label_axes, new_space, world_frame
 from .style import COLORS, ink
-from .tendons import tension_bar, tension_scale
+from .tendons import color_bars
 
-_AREA, _BAR = (0.0, 0.0, 0.83, 0.9), (0.885, 0.25, 0.018, 0.5)
-"""Rectangles of the box and of the colour bar in the figure."""
+_AREA = (0.0, 0.0, 0.83, 0.9)
+"""Rectangle of the box in the figure."""
 _STATIONS = 40
 
 
@@ -32,7 +32,7 @@ def film(
     dpi: int = 100,
 ) -> FuncAnimation:
     """Animation of a sequence of equilibria in one fixed box, with the path of the tip and one
-    scale of tensions, among the obstacles of the first scene.
+    scale of tensions and one of pressures, among the obstacles of the first scene.
 
     Where a solve failed, the last shape before it stays, dimmed, with the message of the status.
 
@@ -55,8 +55,7 @@ def film(
     bodies = _bodies(equilibria)
     points = np.concatenate([body.points for body in bodies])
     around = equilibria[0].scene.obstacles if isinstance(equilibria[0], Equilibrium) else ()
-    tensions = [body.tension for body in bodies if body.tension is not None]
-    scale = tension_scale(tensions)
+    scales = thread_scales(bodies)
     tips = np.array([body.samples.position[-1] for body in bodies])
     ax = new_space()
     figure: Any = ax.figure
@@ -65,7 +64,7 @@ def film(
         for artist in (*ax.lines, *ax.collections, *ax.texts):
             artist.remove()
         ax.plot(*tips[: i + 1].T, color=COLORS[3], linewidth=1.0, label="path of the tip")
-        draw_body(ax, bodies[i], color=ink(0.5), scale=scale)
+        draw_body(ax, bodies[i], color=ink(0.5), scales=scales)
         draw_obstacles(ax, around, points)
         world_frame(ax)
         failed = [] if bodies[i].failure is None else ["no equilibrium"]
@@ -77,7 +76,7 @@ def film(
     label_axes(ax)
     equal_scale(ax, thinnest=0.2)
     fit_height(ax, _AREA)
-    tension_bar(ax, scale, _BAR)
+    color_bars(ax, scales)
     handles = [Line2D([], [], color=COLORS[3], linewidth=1.0, label="path of the tip")]
     figure.legend(handles=handles, loc="upper left")
     interval = 1000 * seconds / len(bodies)

@@ -1,6 +1,7 @@
 """One arm in space: its shape at stations, its tensions, its discs, and how they are drawn; also of
 an arm whose solve failed."""
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -20,7 +21,7 @@ from ..solution.solver import solve
 from ..solution.summary import Summary, stations as checked_stations
 from ..typing import VectorLike
 from .style import ink, shade
-from .tendons import TensionScale, draw_threads, is_slack
+from .tendons import Scales, draw_threads, is_slack, pressure_scale, tension_scale
 
 _DISCS = 13
 _ANGLES = np.linspace(0.0, 2 * np.pi, 33)
@@ -49,13 +50,15 @@ def sample(eq: Equilibrium, stations: VectorLike = 60) -> Summary:
 
 
 class Body(NamedTuple):
-    """An arm as it is drawn: its `samples`; the `tension` of its threads [N] and which are
-    `slack`, None where they are not known; its `discs` [m], shape (discs, angles, 3); whether it is
-    `rigid` between each station and the next, shape (stations - 1,); the `failure` of the solve, in
-    which case the shape is that at rest."""
+    """An arm as it is drawn: its `samples`; the `tension` of its threads [N], NaN for chambers, the
+    `pressure` of its chambers [Pa], NaN for other threads, and which threads are `slack`, None
+    where they are not known; its `discs` [m], shape (discs, angles, 3); whether it is `rigid`
+    between each station and the next, shape (stations - 1,); the `failure` of the solve, in which
+    case the shape is that at rest."""
 
     samples: Summary
     tension: np.ndarray | None
+    pressure: np.ndarray | None
     slack: np.ndarray | None
     discs: np.ndarray
     rigid: np.ndarray
@@ -102,7 +105,7 @@ def body_of(eq: Equilibrium | Summary, stations: VectorLike = 60) -> Body:
     **Raises:** `ValueError` as `sample`, except for a solve that failed.
     """
     if isinstance(eq, Summary):
-        return Body(eq, None, None, np.zeros((0, 1, 3)), np.zeros(len(eq.X) - 1, bool))
+        return Body(eq, None, None, None, np.zeros((0, 1, 3)), np.zeros(len(eq.X) - 1, bool))
     if np.ndim(eq.status) == 0 and not bool(eq.converged):
         return body_of(at_rest(eq), stations)._replace(failure=eq.message)
     if eq.scene.rod.rigid and np.ndim(eq.status) == 0:
@@ -118,17 +121,27 @@ def with_rigid_ends(rod: Rod, X: Float[Array, " stations"]) -> Float[Array, " mo
 
 def body_from_samples(eq: Equilibrium, samples: Summary) -> Body:
     """The arm of a converged equilibrium from its `samples`, as `sample` returns them."""
-    tension = -np.asarray(samples.values["forces"])
+    inflated = np.array([x.pressure_area is not None for x in eq.scene.actuators], bool)
+    tension = np.where(inflated, np.nan, -np.asarray(samples.values["forces"]))
+    pressure = np.where(inflated, np.asarray(eq.inputs), np.nan)
     between = jnp.asarray(samples.X[1:] + samples.X[:-1]) / 2
     flexible = eq.scene.rod.flexible(between)
     rigid = np.zeros(between.shape, bool) if flexible is None else np.asarray(flexible) == 0
-    return Body(samples, tension, is_slack(eq, tension), _discs(eq, samples), rigid)
+    return Body(samples, tension, pressure, is_slack(eq, tension), _discs(eq, samples), rigid)
 
 
 def at_rest(eq: Equilibrium) -> Equilibrium:
     """The arm without loads and inputs."""
     scene = Scene(eq.scene.rod, eq.scene.actuators, free_strains=eq.scene.free_strains)
     return solve(scene, jnp.zeros_like(eq.inputs), model=eq.model)
+
+
+def thread_scales(bodies: Sequence[Body]) -> Scales:
+    """The colours of the threads of some arms."""
+    return Scales(
+        tension_scale([body.tension for body in bodies if body.tension is not None]),
+        pressure_scale([1e-3 * body.pressure for body in bodies if body.pressure is not None]),
+    )
 
 
 def _discs(eq: Equilibrium, samples: Summary) -> np.ndarray:
@@ -149,16 +162,16 @@ def draw_body(
     color: ColorType,
     surface: bool = True,
     threads: bool = True,
-    scale: TensionScale | None = None,
+    scales: Scales | None = None,
     **line: Any,
 ) -> None:
     """The wall with the discs, the threads and the axis of an arm.
 
-    **Arguments:** `scale`: the colours of tensions, by default a shade of `color`; `line`:
+    **Arguments:** `scales`: the colours of threads, by default a shade of `color`; `line`:
     properties of the axis. An arm at rest after a solve that failed is grey and dashed.
     """
     if body.failure is not None:
-        color, scale = ink(0.45), None
+        color, scales = ink(0.45), None
         line = {**line, "linestyle": "--"}
     if surface:
         options = {"linewidth": 0, "rstride": 1, "cstride": 1, "rasterized": True}
@@ -171,10 +184,10 @@ def draw_body(
             ax.add_collection3d(rims, autolim=False)
             ax.auto_scale_xyz(*body.discs.reshape(-1, 3).T, had_data=True)
     paths = np.asarray(body.samples.threads)[: None if threads else 0]
-    if scale is None or body.tension is None or body.slack is None:
+    if scales is None or body.tension is None or body.pressure is None or body.slack is None:
         for path in paths:
             ax.plot(*path.T, color=shade(color), linewidth=0.8)
     elif threads:
-        draw_threads(ax, paths, body.tension, body.slack, scale)
-    width: dict[str, Any] = {} if scale is None else {"linewidth": 0.8}
+        draw_threads(ax, paths, scales.colors(body.tension, 1e-3 * body.pressure), body.slack)
+    width: dict[str, Any] = {} if scales is None else {"linewidth": 0.8}
     ax.plot(*body.samples.position.T, color=color, **(width | line))

@@ -25,7 +25,7 @@ from ..solution.summary import Summary
 from ..typing import VectorLike
 from ..validation import choice
 from . import annotate
-from .body import body_of, draw_body, sample
+from .body import body_of, draw_body, sample, thread_scales
 from .obstacles import draw_obstacles, draw_outlines
 from .space import (
     THINNEST_BOX,
@@ -37,7 +37,7 @@ from .space import (
     world_frame,
 )
 from .style import COLORS, ink, shade, theme
-from .tendons import SLACK_DASHES, tension_bar, tension_scale
+from .tendons import SLACK_DASHES, color_bars
 
 __all__ = [
     "COLORS",
@@ -63,8 +63,8 @@ LABELS: dict[str, str] = dict(
 _LEAST_SPAN = 0.02
 _THINNEST = 0.2
 """Least side of the box of a figure of its own, relative to the longest."""
-_AREA, _BAR = (0.0, 0.0, 0.83, 0.9), (0.885, 0.25, 0.018, 0.5)
-"""Rectangles of the box and of the colour bar in the figure."""
+_AREA = (0.0, 0.0, 0.83, 0.9)
+"""Rectangle of the box in the figure."""
 
 _PAIRS = ((0, 1), (0, 2), (1, 2))
 """Horizontal and vertical axis of each projection of a workspace."""
@@ -90,10 +90,11 @@ def arm(
     """The deformed arm in 3D: its axis, its translucent outer wall or its discs, and its threads,
     at equal scale. The wall of rigid pieces is darker and more opaque.
 
-    With details, threads have the colour of their tension, with a colour bar (blue pushes,
-    vermilion pulls), and are dashed where they are slack; loads are arrows with a legend; obstacles
-    are translucent; the axes of the world's frame and the direction of gravity are drawn. An arm
-    too thin for its threads to be told apart is drawn wider; the legend says by what factor.
+    With details, threads have the colour of their tension and chambers that of their pressure, with
+    a colour bar each (blue pushes, vermilion pulls); slack tendons are dashed; loads are arrows
+    with a legend; obstacles are translucent; the axes of the world's frame and the direction of
+    gravity are drawn. An arm too thin for its threads to be told apart is drawn wider; the legend
+    says by what factor.
 
     Of a solve that failed, the arm at rest is drawn dimmed, with the message of the status.
 
@@ -111,12 +112,12 @@ def arm(
     own, ax = ax is None, checked_space(ax)
     body = body_of(eq, stations)
     details = isinstance(eq, Equilibrium) and (own if details is None else details)
-    scale = None if body.tension is None or not details else tension_scale([body.tension])
+    scales = thread_scales([body]) if details else None
     widening = body.widening if details else 1.0
     if body.failure is not None:
         label = textwrap.fill(f"{label or 'the arm'} at rest; no equilibrium: {body.failure}", 70)
     shown = color if color is not None else ink(0.5) if details else COLORS[0]
-    style = {"color": shown, "linestyle": linestyle, "label": label, "scale": scale, **line}
+    style = {"color": shown, "linestyle": linestyle, "label": label, "scales": scales, **line}
     draw_body(ax, body.widened(widening), surface=surface, threads=threads, **style)
     if details and isinstance(eq, Equilibrium) and body.failure is None:
         annotate.loads(eq, ax, legend=False)
@@ -132,8 +133,8 @@ def arm(
         loose = body.slack if threads and body.failure is None else None
         slack = loose is not None and bool(np.any(loose))
         _legend(ax, slack, widening, own)
-    if own and threads and scale is not None:
-        tension_bar(ax, scale, _BAR)
+    if own and threads and scales is not None:
+        color_bars(ax, scales)
     return ax
 
 

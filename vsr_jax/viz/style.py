@@ -19,6 +19,9 @@ TENSION = LinearSegmentedColormap.from_list("tension", ["#0072B2", "#9a9a9a", "#
 """Diverging map of signed tensions: blue where a thread pushes, grey at zero, vermilion where it
 pulls. Its grey is visible on both themes."""
 
+PRESSURE = TENSION.reversed()
+"""The same for pressures: blue where a chamber pushes, vermilion where a vacuum pulls."""
+
 Theme = Literal["light", "dark"]
 RGB = tuple[float, float, float]
 
