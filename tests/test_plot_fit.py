@@ -69,3 +69,33 @@ def test_residuals_have_the_unit_of_the_measurement(fit):
     ax = vsr.plot_fit.residuals(fit)
     assert ax.get_ylabel() == "residual [m]"
     plt.close("all")
+
+
+def test_measured_rings_do_not_cover_their_predictions(fit):
+    ax = vsr.plot_fit.shapes(fit, axes="xz")
+    rings, points = (
+        [line for line in ax.lines if line.get_marker() == "o" and line.get_fillstyle() == style]
+        for style in ("none", "full")
+    )
+    seen = np.asarray(fit.problem.data.observations[0].value)[[0, 1, 3]].reshape(-1, 3)
+    np.testing.assert_array_equal(rings[0].get_xydata(), seen[:, [0, 2]])
+    assert points[0].get_markersize() < rings[0].get_markersize() / 2
+    plt.close("all")
+
+
+def test_the_overview_is_legible_and_full(fit):
+    with vsr.plot.theme():
+        figure = vsr.plot_fit.overview(fit)
+    figure.canvas.draw()
+    texts = [x for x in figure.findobj(mpl.text.Text) if x.get_visible() and x.get_text()]
+    assert min(text.get_fontsize() for text in texts) >= 8
+    assert [ax.get_xlabel() for ax in figure.axes] == ["x [m]", "x [m]", "", "(1)"]
+    boxes = [ax.get_window_extent() for ax in figure.axes]
+    inside = sum(box.width * box.height for box in boxes)
+    assert inside > 0.65 * figure.bbox.width * figure.bbox.height
+    (title,) = [text.get_text() for text in texts if "rod.material.young" in text.get_text()]
+    number = fit.numbers["rod.material.young"]
+    value, error = 1e-3 * number.value, 1e-3 * number.error
+    assert title == f"(1) rod.material.young = {value:.4g} +- {error:.2g} [1e3 Pa]"
+    assert not vsr.plot_fit.corner(fit, names=[]).axes
+    plt.close("all")

@@ -81,6 +81,7 @@ def _record(title: str, found: Any) -> dict[str, Any]:
 
 def _draw(found: Any, path: str) -> None:
     draw_without_display()
-    from ..viz import plot_fit
+    from ..viz import plot, plot_fit
 
-    plot_fit.overview(found).savefig(path, dpi=150)
+    with plot.theme():
+        plot_fit.overview(found).savefig(path, dpi=150)
