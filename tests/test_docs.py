@@ -1,6 +1,7 @@
 """README.md and docs/: the list of public names is complete, links lead to files and headings that
-exist, the quick start prints what it says."""
+exist, the quick start prints what it says, signatures are short."""
 
+import inspect
 import pathlib
 import re
 import runpy
@@ -47,6 +48,26 @@ def test_the_list_of_quantities_is_the_table():
     ]
     text = read(ROOT / "docs/api.md")
     assert [line for line in text.splitlines() if line.startswith("| `eq.")] == rows
+
+
+def signatures(name):
+    """Signatures of a public name, of its methods if it is a class, of its functions if it is a
+    module."""
+    thing = getattr(vsr, name)
+    found = [] if inspect.ismodule(thing) else [thing]
+    found += [
+        part
+        for label, part in inspect.getmembers(
+            thing, lambda x: inspect.isfunction(x) or inspect.isclass(x)
+        )
+        if label[0] != "_" or label == "__call__"
+    ]
+    return [str(inspect.signature(x)) for x in found if x.__module__.startswith("vsr_jax.")]
+
+
+@pytest.mark.parametrize("name", sorted({*vsr.__all__} - {"SolveError"}))  # exceptions have none
+def test_signatures_name_what_is_like_an_array(name):
+    assert not [text for text in signatures(name) if "numpy.number" in text]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

@@ -1,5 +1,8 @@
 """Types that signatures share: array shapes (see jaxtyping for the notation), arguments that are
-converted to arrays, paths; and the change of precision of a tree."""
+converted to arrays, paths; and the conversion of numbers and of the precision of a tree.
+
+What is converted has a type with a name, which help and messages show in place of its members.
+"""
 
 import os
 from collections.abc import Sequence
@@ -7,23 +10,40 @@ from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
-from jax.typing import ArrayLike, DTypeLike
-from jaxtyping import Array, Float
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Real
+from typing_extensions import TypeAliasType
 
 Scalar = Float[Array, ""]
 Twist = Float[Array, "6"]
 Pose = Float[Array, "4 4"]
 
-VectorLike = ArrayLike | Sequence[ArrayLike]
+ScalarLike = TypeAliasType("ScalarLike", Real[jax.typing.ArrayLike, ""])
+"""A real number: of Python, NumPy or JAX."""
+
+VectorLike = TypeAliasType("VectorLike", jax.typing.ArrayLike | Sequence[ScalarLike])
 """An array of one axis, or a list or tuple of numbers."""
 
-MatrixLike = ArrayLike | Sequence[VectorLike]
+MatrixLike = TypeAliasType("MatrixLike", jax.typing.ArrayLike | Sequence[VectorLike])
 """An array of two axes, or a list or tuple of its rows."""
 
-PathLike = str | os.PathLike[str]
+ArrayLike = TypeAliasType("ArrayLike", jax.typing.ArrayLike | Sequence)
+"""A number, an array of any number of axes, or lists or tuples in each other."""
+
+DTypeLike = TypeAliasType("DTypeLike", jax.typing.DTypeLike)
+"""What names a precision, as `"float32"` and `jnp.float64`."""
+
+PathLike = TypeAliasType("PathLike", str | os.PathLike[str])
 """The path of a file or folder."""
 
 Tree = TypeVar("Tree")
+
+
+def real(value: ArrayLike) -> Array:
+    """`value` as a floating-point array. Numbers of Python and integers take the precision of what
+    they are combined with."""
+    array = jnp.asarray(value)
+    return array if jnp.issubdtype(array.dtype, jnp.floating) else 1.0 * array
 
 
 def cast(tree: Tree, dtype: DTypeLike) -> Tree:

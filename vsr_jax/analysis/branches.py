@@ -11,7 +11,7 @@ where $\partial r / \partial y$ is singular.
 (1977).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -20,7 +20,6 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.flatten_util import ravel_pytree
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..arm.scene import Scene
@@ -34,7 +33,7 @@ from ..numerics.component import add, multiply, subtract
 from ..numerics.quadrature import Grid
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve, status_of_inputs
-from ..typing import Scalar, cast
+from ..typing import ArrayLike, Scalar, cast
 from ..validation import count, instance, numbers
 
 _MOST_CORRECTIONS = 8
@@ -49,7 +48,7 @@ _LEAST_COSINE = 0.9
 to another branch."""
 
 SceneOrPath = Scene | Callable[[Scalar], Scene]
-InputPath = Callable[[Scalar], ArrayLike | Sequence]
+InputPath = Callable[[Scalar], ArrayLike]
 
 
 class Branch(eqx.Module):

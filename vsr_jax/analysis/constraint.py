@@ -9,13 +9,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..arm.obstacles import Obstacle
 from ..mechanics.sizes import softest
 from ..solution.bearing import Contact
-from ..typing import Scalar
+from ..typing import Scalar, ScalarLike
 from ..validation import instances, numbers, positive
 from .arms import Arms
 
@@ -56,7 +55,7 @@ class Inside(Constraint):
 
     wall: Scalar
 
-    def __init__(self, wall: ArrayLike = 0.0):
+    def __init__(self, wall: ScalarLike = 0.0):
         self.wall = numbers("Inside.wall", wall, least=0.0)
 
     def __call__(self, arms: Arms) -> Float[Array, " margins"]:
@@ -165,7 +164,9 @@ class Clearance(Constraint):
     distance: Scalar
     obstacles: tuple[Obstacle, ...] | None
 
-    def __init__(self, distance: ArrayLike, obstacles: Sequence[Obstacle] | Obstacle | None = None):
+    def __init__(
+        self, distance: ScalarLike, obstacles: Sequence[Obstacle] | Obstacle | None = None
+    ):
         self.distance = numbers("Clearance.distance", distance, least=0.0)
         self.obstacles = None
         if obstacles is not None:

@@ -9,7 +9,6 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..arm.loads import TipWrench
@@ -21,7 +20,7 @@ from ..numerics import component as c
 from ..numerics.compiling import program
 from ..numerics.se3 import skew, unskew
 from ..solution.equilibrium import Equilibrium
-from ..typing import Pose
+from ..typing import Pose, ScalarLike, VectorLike
 
 
 class SensitivityRow(NamedTuple):
@@ -207,7 +206,7 @@ def ellipsoid(matrix: Float[Array, "3 columns"], centre: Float[Array, "3"]) -> E
     return Ellipsoid(centre, jnp.zeros((3, 3), U.dtype).at[:, : lengths.size].set(U * lengths))
 
 
-def manipulability(eq: Equilibrium, scale: ArrayLike = 1.0) -> Ellipsoid:
+def manipulability(eq: Equilibrium, scale: VectorLike = 1.0) -> Ellipsoid:
     r"""Manipulability ellipsoid: displacements of the tip for changes of the inputs with $\sum_i
     (\delta u_i / s_i)^2 \le 1$.
 
@@ -220,9 +219,9 @@ def manipulability(eq: Equilibrium, scale: ArrayLike = 1.0) -> Ellipsoid:
     **Source:** T. Yoshikawa, Manipulability of Robotic Mechanisms, Int. J. Robotics Research 4
     (1985).
     """
-    return ellipsoid(tip_jacobian(eq)[3:] * scale, eq.tip[:3, 3])
+    return ellipsoid(tip_jacobian(eq)[3:] * jnp.asarray(scale, eq.inputs.dtype), eq.tip[:3, 3])
 
 
-def compliance_ellipsoid(eq: Equilibrium, force: ArrayLike = 1.0) -> Ellipsoid:
+def compliance_ellipsoid(eq: Equilibrium, force: ScalarLike = 1.0) -> Ellipsoid:
     """Displacements of the tip for forces on it of at most `force` [N] in any direction."""
     return ellipsoid(compliance(eq)[3:, 3:] * force, eq.tip[:3, 3])

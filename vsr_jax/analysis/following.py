@@ -17,12 +17,9 @@ force of at most $\mu \lambda$, or it slips, and $\mu \lambda$ opposes its motio
 considerations on transmission characteristics for tendon drive robots, ICAR 1991.
 """
 
-from collections.abc import Sequence
-
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.typing import ArrayLike
 from jaxtyping import Array
 
 from ..arm.scene import Scene
@@ -31,13 +28,13 @@ from ..models.strain_dependent import StrainDependent
 from ..numerics.compiling import program
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import checked_outcome, near_of
-from ..typing import cast
+from ..typing import ArrayLike, cast
 from ..validation import instance, numbers
 
 
 def follow(
     scene: Scene,
-    inputs: ArrayLike | Sequence,
+    inputs: ArrayLike,
     *,
     model: StrainDependent | None = None,
     start: Equilibrium | None = None,
@@ -86,7 +83,7 @@ def follow(
     return jax.vmap(lambda u, outcome: Equilibrium(scene, u, model, outcome))(values, outcomes)
 
 
-def _path(scene: Scene, inputs: ArrayLike | Sequence) -> Array:
+def _path(scene: Scene, inputs: ArrayLike) -> Array:
     values = numbers("inputs", inputs, None, finite=False)
     if values.ndim != 2 or values.shape[1] != len(scene.actuators) or not len(values):
         raise ValueError(

@@ -5,7 +5,7 @@ scene can be solved for every smaller factor. A bracket on a logarithmic scale i
 factors in parallel and narrowed to the interval before the first failure, four times.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array
 
 from ..arm.scene import Scene
@@ -25,7 +24,7 @@ from ..numerics.component import norm, scale, split, times
 from ..numerics.quadrature import make_grid
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
-from ..typing import Scalar
+from ..typing import ArrayLike, DTypeLike, Scalar
 from ..validation import is_traced
 from .plausible import strain_warnings, warnings_of
 
@@ -200,7 +199,7 @@ _REMEDIES = {
 """Advice for a solve that failed."""
 
 
-def check(scene: Scene, inputs: ArrayLike | Sequence, *, model: Model | None = None) -> Health:
+def check(scene: Scene, inputs: ArrayLike, *, model: Model | None = None) -> Health:
     """Health of one solve: stability margin, distance to failure, resolution, conditioning. Takes
     one further solve, and 64 for each of inputs and loads that the scene has.
 

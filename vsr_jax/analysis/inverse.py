@@ -19,7 +19,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Bool, Float
 
 from ..arm.scene import Scene
@@ -30,7 +29,7 @@ from ..numerics.component import norm, split
 from ..numerics.se3 import rotation_vector
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
-from ..typing import Pose, Scalar, cast
+from ..typing import ArrayLike, DTypeLike, Pose, Scalar, cast
 from ..validation import instance, instances, interval, is_traced, numbers, on_arm, positive, rigid
 from .constraint import Constraint
 from .margins import margins_of, shortfall, violation
@@ -98,10 +97,10 @@ class Reach(NamedTuple):
 
 def reach(
     scene: Scene,
-    target: ArrayLike | Sequence,
-    bounds: Sequence[ArrayLike | Sequence],
+    target: ArrayLike,
+    bounds: Sequence[ArrayLike],
     *,
-    X: ArrayLike | Sequence | None = None,
+    X: ArrayLike | None = None,
     constraints: Sequence[Constraint] = (),
     model: Model | None = None,
     allowed_miss: float | None = None,
@@ -236,7 +235,7 @@ def _check_target(target: Array, X: Array | None, scene: Scene) -> None:
 
 
 def _check_bounds(
-    scene: Scene, bounds: Sequence[ArrayLike | Sequence], dtype: DTypeLike
+    scene: Scene, bounds: Sequence[ArrayLike], dtype: DTypeLike
 ) -> tuple[Array, Array]:
     size = len(scene.actuators)
     if not size:

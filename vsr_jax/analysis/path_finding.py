@@ -22,7 +22,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from ..arm.scene import Scene
@@ -31,7 +30,7 @@ from ..numerics import bounded_least_squares
 from ..numerics.compiling import messages, program
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
-from ..typing import Scalar, VectorLike, cast
+from ..typing import ArrayLike, Scalar, VectorLike, cast
 from ..validation import concrete, count, instance, instances, interval, is_traced
 from .constraint import Constraint
 from .margins import margins_of, shortfall, violation
@@ -76,7 +75,7 @@ def find_path(
     scene: Scene,
     first: VectorLike,
     last: VectorLike,
-    bounds: Sequence[ArrayLike | Sequence],
+    bounds: Sequence[ArrayLike],
     constraints: Sequence[Constraint],
     *,
     samples: int = 33,

@@ -15,6 +15,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 
 from ..files.output import beside, replacing
+from ..typing import PathLike
 from .sweep_labels import Label, Labels
 
 try:
@@ -94,7 +95,7 @@ class Archive:
 
     def __init__(
         self,
-        path: str | os.PathLike,
+        path: PathLike,
         like: Arrays,
         samples: Arrays,
         chunk: int,

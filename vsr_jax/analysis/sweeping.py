@@ -1,7 +1,6 @@
 """`sweep`: equilibria of any number of samples, in chunks, on all cores, devices and processes,
 stored in memory or on disk."""
 
-import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,7 +16,7 @@ from ..arm.scene import Scene
 from ..models.base import Model, Status
 from ..numerics.fingerprint import fingerprint
 from ..solution.equilibrium import Equilibrium
-from ..typing import VectorLike
+from ..typing import PathLike, VectorLike
 from ..validation import count
 from .sweep_labels import labels
 from .sweep_program import Program, Task, number, stored_outputs
@@ -81,7 +80,7 @@ def sweep(
     *,
     outputs: Outputs = "tip",
     model: Model | None = None,
-    out: str | os.PathLike | None = None,
+    out: PathLike | None = None,
     chunk: int | None = None,
     memory: int = _MEMORY,
     devices: Sequence[Any] | None = None,
@@ -245,7 +244,7 @@ def _flat(samples: PyTree) -> dict[str, np.ndarray]:
 
 
 def _archive(
-    out: str | os.PathLike, task: Task, like: Mapping[str, Any], samples: PyTree, chunk: int
+    out: PathLike, task: Task, like: Mapping[str, Any], samples: PyTree, chunk: int
 ) -> Archive:
     flat = _flat(samples)
     digest = fingerprint(task, (jax.tree.map(lambda x: x[0], samples),), samples)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..typing import ArrayLike, Scalar, VectorLike
+from ..typing import Scalar, ScalarLike, VectorLike
 from ..validation import choice, concrete, count, instance, numbers
 from .description import Part
 from .routing import Routing
@@ -108,7 +108,7 @@ class Actuator(Part):
 
 
 def _checked(
-    actuator: str, routing: Routing, start: ArrayLike | None, end: ArrayLike | None
+    actuator: str, routing: Routing, start: ScalarLike | None, end: ScalarLike | None
 ) -> tuple[Routing, Scalar | None, Scalar | None]:
     needed = "a routing such as Parallel, Linear, Helix, Polynomial, Spline or Function"
     path = instance(f"{actuator}.routing", routing, Routing, needed)
@@ -134,7 +134,7 @@ class Thread(Actuator):
     effect = "threads"
 
     def __init__(
-        self, routing: Routing, *, start: ArrayLike | None = None, end: ArrayLike | None = None
+        self, routing: Routing, *, start: ScalarLike | None = None, end: ScalarLike | None = None
     ):
         self.routing, self.start, self.end = _checked("Thread", routing, start, end)
 
@@ -200,11 +200,11 @@ class Tendon(Actuator):
         self,
         routing: Routing,
         *,
-        start: ArrayLike | None = None,
-        end: ArrayLike | None = None,
+        start: ScalarLike | None = None,
+        end: ScalarLike | None = None,
         control: Literal["tension", "length"] = "tension",
-        stiffness: ArrayLike | None = None,
-        friction: ArrayLike | None = None,
+        stiffness: ScalarLike | None = None,
+        friction: ScalarLike | None = None,
         motion: Literal["pull", "release"] = "pull",
         discs: int | None = None,
         disc_places: VectorLike | None = None,
@@ -329,10 +329,10 @@ class Chamber(Actuator):
     def __init__(
         self,
         routing: Routing,
-        area: ArrayLike,
+        area: ScalarLike,
         *,
-        start: ArrayLike | None = None,
-        end: ArrayLike | None = None,
+        start: ScalarLike | None = None,
+        end: ScalarLike | None = None,
     ):
         self.routing, self.start, self.end = _checked("Chamber", routing, start, end)
         self.area = numbers("Chamber.area", area, positive=True)

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..typing import ArrayLike, MatrixLike, Scalar, VectorLike
+from ..typing import MatrixLike, Scalar, ScalarLike, VectorLike
 from ..validation import is_traced, numbers, rigid
 from .description import Part
 from .rod import Rod
@@ -39,7 +39,7 @@ class Held(Part):
 
     def __init__(
         self,
-        X: ArrayLike | None = None,
+        X: ScalarLike | None = None,
         *,
         position: VectorLike | None = None,
         orientation: MatrixLike | None = None,

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..numerics.component import Vector3, Wrench, scale, split
-from ..typing import ArrayLike, Scalar, VectorLike
+from ..typing import Scalar, ScalarLike, VectorLike
 from ..validation import choice, numbers
 from .description import Part
 from .profile import ProfilesLike, ProfileVector, as_profiles, breakpoints_of, values_at
@@ -115,7 +115,7 @@ class Gravity(Load):
     effect = "gravity"
 
     def __init__(
-        self, acceleration: VectorLike = (0.0, 0.0, -9.81), fluid_density: ArrayLike | None = None
+        self, acceleration: VectorLike = (0.0, 0.0, -9.81), fluid_density: ScalarLike | None = None
     ):
         self.acceleration = numbers("Gravity.acceleration", acceleration, (3,))
         self.fluid_density = (
@@ -156,7 +156,7 @@ class PointWrench(Load):
 
     def __init__(
         self,
-        X: ArrayLike,
+        X: ScalarLike,
         force: VectorLike = (0.0, 0.0, 0.0),
         moment: VectorLike = (0.0, 0.0, 0.0),
         frame: Frame = "world",

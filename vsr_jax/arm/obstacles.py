@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..numerics.component import dot, join, norm, split
-from ..typing import ArrayLike, MatrixLike, Pose, Scalar, VectorLike
+from ..typing import MatrixLike, Pose, Scalar, ScalarLike, VectorLike
 from ..validation import concrete, numbers, rigid
 from .description import Part
 from .functions import Position, function_of_position
@@ -79,7 +79,7 @@ def local_point(pose: Pose | None, point: Position) -> Position:
     return join(tuple(dot(split(pose[:3, j]), apart) for j in range(3)))
 
 
-def coefficient(name: str, friction: ArrayLike | None) -> Scalar | None:
+def coefficient(name: str, friction: ScalarLike | None) -> Scalar | None:
     """A coefficient of friction; None without."""
     return None if friction is None else numbers(f"{name}.friction", friction, least=0.0)
 
@@ -117,7 +117,7 @@ class Plane(Obstacle):
         normal: VectorLike,
         point: VectorLike = (0.0, 0.0, 0.0),
         *,
-        friction: ArrayLike | None = None,
+        friction: ScalarLike | None = None,
     ):
         self.friction = coefficient("Plane", friction)
         self.normal = numbers("Plane.normal", normal, (3,))
@@ -146,7 +146,9 @@ class Sphere(Obstacle):
     radius: Scalar = eqx.field(metadata={"unit": "m"})
     effect = "sphere"
 
-    def __init__(self, centre: VectorLike, radius: ArrayLike, *, friction: ArrayLike | None = None):
+    def __init__(
+        self, centre: VectorLike, radius: ScalarLike, *, friction: ScalarLike | None = None
+    ):
         self.friction = coefficient("Sphere", friction)
         self.centre = numbers("Sphere.centre", centre, (3,))
         self.radius = numbers("Sphere.radius", radius, positive=True)
@@ -176,11 +178,11 @@ class Cylinder(Obstacle):
 
     def __init__(
         self,
-        radius: ArrayLike,
+        radius: ScalarLike,
         *,
-        length: ArrayLike | None = None,
+        length: ScalarLike | None = None,
         pose: MatrixLike | None = None,
-        friction: ArrayLike | None = None,
+        friction: ScalarLike | None = None,
     ):
         self.friction = coefficient("Cylinder", friction)
         self.radius = numbers("Cylinder.radius", radius, positive=True)
@@ -219,8 +221,8 @@ class Box(Obstacle):
         size: VectorLike,
         *,
         pose: MatrixLike | None = None,
-        rounding: ArrayLike = 0.0,
-        friction: ArrayLike | None = None,
+        rounding: ScalarLike = 0.0,
+        friction: ScalarLike | None = None,
     ):
         self.friction = coefficient("Box", friction)
         self.size = numbers("Box.size", size, (3,), positive=True)
@@ -255,7 +257,7 @@ class Field(Obstacle):
     effect = "distance field"
 
     def __init__(
-        self, function: Callable[[Position], ArrayLike], *, friction: ArrayLike | None = None
+        self, function: Callable[[Position], ScalarLike], *, friction: ScalarLike | None = None
     ):
         self.friction = coefficient("Field", friction)
         if not callable(function):

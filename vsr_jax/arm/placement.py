@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..numerics.component import norm, split
-from ..typing import ArrayLike, Pose, VectorLike
+from ..typing import Pose, ScalarLike, VectorLike
 from ..validation import choice, concrete, numbers
 
 Direction = Literal["forward", "back", "left", "right", "up", "down"]
@@ -25,7 +25,7 @@ def pose(
     position: VectorLike = (0.0, 0.0, 0.0),
     *,
     pointing: Direction | VectorLike = "forward",
-    roll: ArrayLike = 0.0,
+    roll: ScalarLike = 0.0,
 ) -> Pose:
     r"""Rigid transform of a base whose arm starts at a point and points in a direction:
     $g = \begin{pmatrix} R(t)\,R_x(\varphi) & r \\ 0 & 1 \end{pmatrix}$.

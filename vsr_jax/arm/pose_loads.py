@@ -18,9 +18,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+from typing_extensions import TypeAliasType
 
 from ..numerics.stacked import cross, dot, matmul, matvec, skew
-from ..typing import ArrayLike, Scalar, Twist, VectorLike
+from ..typing import Scalar, ScalarLike, Twist, VectorLike
 from ..validation import choice, numbers
 from .functions import Position, function_of_position
 from .loads import THREE_PROFILES, Frame, Load, mass_per_length, need_density
@@ -36,7 +37,8 @@ from .rod import Rod
 Needs = Literal["rotation", "pose"]
 
 Rotation = Float[Array, "3 3"]
-FieldLike = VectorLike | Callable[[Position], ArrayLike]
+FieldLike = TypeAliasType("FieldLike", VectorLike | Callable[[Position], VectorLike])
+"""A field in space: a uniform one, or a function of the position."""
 
 
 class PoseLoad(Load):
@@ -132,7 +134,7 @@ class _AtPoint(PoseLoad):
         return () if self.X is None else (self.X,)
 
 
-def _abscissa(name: str, X: ArrayLike | None) -> Scalar | None:
+def _abscissa(name: str, X: ScalarLike | None) -> Scalar | None:
     return None if X is None else numbers(name, X, least=0.0)
 
 
@@ -160,9 +162,9 @@ class Spring(_AtPoint):
     def __init__(
         self,
         anchor: VectorLike,
-        stiffness: ArrayLike,
-        X: ArrayLike | None = None,
-        length: ArrayLike = 0.0,
+        stiffness: ScalarLike,
+        X: ScalarLike | None = None,
+        length: ScalarLike = 0.0,
         offset: VectorLike = (0.0, 0.0, 0.0),
         kind: Literal["both", "cord"] = "both",
     ):
@@ -206,12 +208,12 @@ class Payload(_AtPoint):
 
     def __init__(
         self,
-        mass: ArrayLike,
-        X: ArrayLike | None = None,
+        mass: ScalarLike,
+        X: ScalarLike | None = None,
         offset: VectorLike = (0.0, 0.0, 0.0),
         acceleration: VectorLike = (0.0, 0.0, -9.81),
-        volume: ArrayLike = 0.0,
-        fluid_density: ArrayLike = 0.0,
+        volume: ScalarLike = 0.0,
+        fluid_density: ScalarLike = 0.0,
     ):
         self.mass = numbers("Payload.mass", mass, least=0.0)
         self.X = _abscissa("Payload.X", X)
@@ -276,7 +278,7 @@ class MagneticMoment(_Magnetic, _AtPoint):
     X: Scalar | None = eqx.field(metadata={"unit": "m"})
     effect = "magnetic moment"
 
-    def __init__(self, moment: VectorLike, field: FieldLike, X: ArrayLike | None = None):
+    def __init__(self, moment: VectorLike, field: FieldLike, X: ScalarLike | None = None):
         self.moment = numbers("MagneticMoment.moment", moment, (3,))
         self.field = _field("MagneticMoment.field", field)
         self.X = _abscissa("MagneticMoment.X", X)

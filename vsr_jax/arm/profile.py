@@ -16,8 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
+from typing_extensions import TypeAliasType
 
-from ..typing import ArrayLike, Scalar, Tree, VectorLike
+from ..typing import Scalar, ScalarLike, Tree, VectorLike
 from ..validation import concrete, numbers
 from .description import Part, describe
 from .fields import OF_OWNER
@@ -84,10 +85,12 @@ class Profile(Part):
         return ()
 
 
-ProfileLike = Profile | ArrayLike | Callable[..., ArrayLike]
+ProfileLike = TypeAliasType("ProfileLike", Profile | ScalarLike | Callable[..., ScalarLike])
 """What is converted to a profile: a number, or a function of X."""
 
-ProfilesLike = ArrayLike | Sequence[ProfileLike] | Callable[..., Sequence[ArrayLike] | Array]
+ProfilesLike = TypeAliasType(
+    "ProfilesLike", jax.typing.ArrayLike | Sequence[ProfileLike] | Callable[..., VectorLike]
+)
 """What is converted to several profiles: one for each, or one function of X that returns a number
 for each."""
 
@@ -97,7 +100,7 @@ class Constant(Profile):
 
     value: Scalar = eqx.field(metadata={"unit": OF_OWNER, "named": False})
 
-    def __init__(self, value: ArrayLike):
+    def __init__(self, value: ScalarLike):
         self.value = numbers("Constant.value", value)
 
     def __call__(self, X: Scalar, length: Scalar) -> Scalar:
@@ -110,7 +113,7 @@ class Taper(Profile):
     base: Scalar = eqx.field(metadata={"unit": OF_OWNER})
     tip: Scalar = eqx.field(metadata={"unit": OF_OWNER})
 
-    def __init__(self, base: ArrayLike, tip: ArrayLike):
+    def __init__(self, base: ScalarLike, tip: ScalarLike):
         self.base = numbers("Taper.base", base)
         self.tip = numbers("Taper.tip", tip)
 
@@ -215,7 +218,7 @@ class FunctionProfile(Profile):
 
     function: FunctionOfX
 
-    def __init__(self, function: Callable[..., ArrayLike], *parameters: PyTree):
+    def __init__(self, function: Callable[..., ScalarLike], *parameters: PyTree):
         self.function = FunctionOfX("FunctionProfile", function, *parameters)
 
     def __call__(self, X: Scalar, length: Scalar) -> Scalar:

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..typing import ArrayLike, Scalar
+from ..typing import Scalar, ScalarLike
 from ..validation import ROUNDING, is_traced, numbers
 from .description import Part
 
@@ -29,7 +29,7 @@ class RigidPiece(Part):
     start: Scalar | None = eqx.field(metadata={"unit": "m"})
     end: Scalar | None = eqx.field(metadata={"unit": "m"})
 
-    def __init__(self, start: ArrayLike | None = None, end: ArrayLike | None = None):
+    def __init__(self, start: ScalarLike | None = None, end: ScalarLike | None = None):
         self.start = None if start is None else numbers("RigidPiece.start", start, least=0.0)
         self.end = None if end is None else numbers("RigidPiece.end", end, positive=True)
         if not any(x is None or is_traced(x) for x in (self.start, self.end)):

@@ -8,7 +8,7 @@ from jaxtyping import Array
 
 from ..numerics.component import Vector, norm
 from ..numerics.se3 import nearest_pose
-from ..typing import ArrayLike, MatrixLike, Pose, Scalar
+from ..typing import MatrixLike, Pose, Scalar, ScalarLike
 from ..validation import instance, instances, numbers, rigid as rigid_transform
 from .description import Part
 from .material import Material
@@ -59,13 +59,13 @@ class Rod(Part):
 
     def __init__(
         self,
-        length: ArrayLike,
+        length: ScalarLike,
         section: Section,
         material: Material,
         *,
         rest_strain: ProfilesLike | None = STRAIGHT,
         base: MatrixLike | None = None,
-        guide_radius: ArrayLike | None = None,
+        guide_radius: ScalarLike | None = None,
         rigid: Sequence[RigidPiece] | RigidPiece = (),
     ):
         self.length = numbers("Rod.length", length, positive=True)

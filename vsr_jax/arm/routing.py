@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from ..numerics.component import Vector, Vector3
-from ..typing import ArrayLike, Scalar, VectorLike
+from ..typing import Scalar, ScalarLike, VectorLike
 from ..validation import choice, numbers
 from .description import Part
 from .profile import FunctionOfX, rising_coefficients
@@ -65,7 +65,7 @@ class Parallel(Routing):
     y: Scalar = eqx.field(metadata={"unit": "m"})
     z: Scalar = eqx.field(metadata={"unit": "m"})
 
-    def __init__(self, y: ArrayLike, z: ArrayLike):
+    def __init__(self, y: ScalarLike, z: ScalarLike):
         self.y = numbers("Parallel.y", y)
         self.z = numbers("Parallel.z", z)
 
@@ -83,7 +83,7 @@ class Linear(Routing):
     slope_z: Scalar = eqx.field(metadata={"unit": "-"})
 
     def __init__(
-        self, y: ArrayLike, z: ArrayLike, slope_y: ArrayLike = 0.0, slope_z: ArrayLike = 0.0
+        self, y: ScalarLike, z: ScalarLike, slope_y: ScalarLike = 0.0, slope_z: ScalarLike = 0.0
     ):
         self.y = numbers("Linear.y", y)
         self.z = numbers("Linear.z", z)
@@ -115,11 +115,11 @@ class Helix(Routing):
 
     def __init__(
         self,
-        radius: ArrayLike,
-        angle: ArrayLike | None = None,
+        radius: ScalarLike,
+        angle: ScalarLike | None = None,
         *,
-        pitch: ArrayLike | None = None,
-        phase: ArrayLike = 0.0,
+        pitch: ScalarLike | None = None,
+        phase: ScalarLike = 0.0,
         hand: Literal["right", "left"] = "right",
     ):
         if (angle is None) == (pitch is None):
@@ -190,7 +190,7 @@ class Function(Routing):
 
     function: FunctionOfX
 
-    def __init__(self, function: Callable[..., tuple[ArrayLike, ArrayLike]], *parameters: PyTree):
+    def __init__(self, function: Callable[..., tuple[ScalarLike, ScalarLike]], *parameters: PyTree):
         self.function = FunctionOfX("Function", function, *parameters)
 
     def __call__(self, X: Scalar) -> tuple[Scalar, Scalar]:

@@ -328,8 +328,8 @@ class Scene(Part):
 
     def replace(
         self,
-        name: str | Mapping[str, ArrayLike | VectorLike],
-        value: ArrayLike | VectorLike | None = None,
+        name: str | Mapping[str, ArrayLike],
+        value: ArrayLike | None = None,
     ) -> "Scene":
         """The scene with other numbers: `scene.replace("rod.material.young", 6e5)`, or several by
         `scene.replace({"rod.length": 0.3, "actuators[*].routing.radius": 0.004})`.

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..typing import ArrayLike, VectorLike
+from ..typing import ArrayLike
 from ..validation import numbers
 from .description import Part
 from .fields import Unit, coefficient_unit, item_unit, unit_of
@@ -70,7 +70,7 @@ def matching(pattern: str, known: Mapping[str, object]) -> list[str]:
     return names
 
 
-def checked_values(scene: Part, values: Mapping[str, ArrayLike | VectorLike]) -> dict[str, Array]:
+def checked_values(scene: Part, values: Mapping[str, ArrayLike]) -> dict[str, Array]:
     """New values of named numbers of a scene by their full names, in the precision and the shape of
     the numbers that they replace; one number stands for all of an array.
 

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..numerics.component import norm, split
 from ..numerics.quadrature import ascending
-from ..typing import ArrayLike, MatrixLike, Pose, Scalar
+from ..typing import MatrixLike, Pose, Scalar, ScalarLike
 from ..validation import concrete, numbers, rigid
 from .functions import Position
 from .obstacles import Obstacle, coefficient, local_point
@@ -58,7 +58,7 @@ class Tube(Obstacle):
         line: MatrixLike | None = None,
         *,
         pose: MatrixLike | None = None,
-        friction: ArrayLike | None = None,
+        friction: ScalarLike | None = None,
     ):
         self.friction = coefficient("Tube", friction)
         self.radius = as_profile("Tube.radius", radius, positive=True)

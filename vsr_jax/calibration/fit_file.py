@@ -27,7 +27,6 @@ loss = "huber"
 
 import csv
 import tomllib
-from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,6 +34,7 @@ import numpy as np
 
 from ..arm.scene import Scene
 from ..files.scene_file import at, check_keys, construct, kind_of, load, parse_table
+from ..typing import PathLike
 from ..validation import instance
 from .measurements import Measurements
 from .observation import Curvatures, Markers, Observation, Tensions
@@ -61,7 +61,7 @@ class FitFile(NamedTuple):
     options: dict[str, Any]
 
 
-def load_fit(path: str | PathLike[str]) -> FitFile:
+def load_fit(path: PathLike) -> FitFile:
     """Reads a fit from a TOML file and the CSV file that it names.
 
     **Raises:** a one-line `ValueError` that begins with the file's name, as `load`.

@@ -34,7 +34,7 @@ class Measurements(eqx.Module):
 
     def __init__(
         self,
-        inputs: ArrayLike | Sequence,
+        inputs: ArrayLike,
         observations: Observation | Sequence[Observation],
         *,
         series: Sequence[str] | None = None,

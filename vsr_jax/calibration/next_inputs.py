@@ -8,7 +8,6 @@ those before it leave.
 **Source:** Atkinson, Donev, Tobias, Optimum Experimental Designs, with SAS (2007), chapter 11.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -37,7 +36,7 @@ class NextMeasurement(NamedTuple):
 
 
 def next_measurement(
-    fit: Fit, candidates: ArrayLike | Sequence, number: int = 1, *, series: str | None = None
+    fit: Fit, candidates: ArrayLike, number: int = 1, *, series: str | None = None
 ) -> NextMeasurement:
     """The inputs that would tell most about the unknowns, by the compiled program of the fit.
 

@@ -25,7 +25,7 @@ from jaxtyping import Array, Float
 from ..arm.rod import Rod
 from ..numerics.se3 import rotation_vector
 from ..solution.equilibrium import Equilibrium
-from ..typing import ArrayLike, MatrixLike
+from ..typing import ArrayLike, MatrixLike, ScalarLike
 from ..validation import instance, numbers, on_arm, rigid
 
 
@@ -83,7 +83,7 @@ class Observation(eqx.Module):
         """
 
 
-def _values(name: str, value: ArrayLike | Sequence, *ends: tuple[int, ...]) -> Array:
+def _values(name: str, value: ArrayLike, *ends: tuple[int, ...]) -> Array:
     """`value` of shape (shapes, rows, *end) for one of the `ends`; a missing axis of rows is
     added."""
     array = numbers(name, value, None, finite=False)
@@ -98,7 +98,7 @@ def _values(name: str, value: ArrayLike | Sequence, *ends: tuple[int, ...]) -> A
     raise ValueError(f"{name}: got shape {array.shape}, need {needed}")
 
 
-def _stations(name: str, X: ArrayLike | Sequence | None, rows: int) -> Array | None:
+def _stations(name: str, X: ArrayLike | None, rows: int) -> Array | None:
     if X is None:
         if rows != 1:
             raise ValueError(f"{name}: got None for {rows} points, need an abscissa [m] for each")
@@ -109,7 +109,7 @@ def _stations(name: str, X: ArrayLike | Sequence | None, rows: int) -> Array | N
     return array
 
 
-def deviation(name: str, sd: ArrayLike | Sequence | None) -> Array | None:
+def deviation(name: str, sd: ArrayLike | None) -> Array | None:
     """`sd` as an array of positive numbers; None is none given."""
     return None if sd is None else numbers(name, sd, None, positive=True)
 
@@ -156,11 +156,11 @@ class Markers(Observation):
 
     def __init__(
         self,
-        position: ArrayLike | Sequence,
-        X: ArrayLike | Sequence | None = None,
+        position: ArrayLike,
+        X: ArrayLike | None = None,
         *,
-        offset: ArrayLike | Sequence = (0.0, 0.0, 0.0),
-        sd: ArrayLike | Sequence | None = None,
+        offset: ArrayLike = (0.0, 0.0, 0.0),
+        sd: ArrayLike | None = None,
         frame: MatrixLike | None = None,
         labels: Sequence[str] | None = None,
         name: str = "markers",
@@ -226,11 +226,11 @@ class Poses(Observation):
 
     def __init__(
         self,
-        pose: ArrayLike | Sequence,
-        X: ArrayLike | Sequence | None = None,
+        pose: ArrayLike,
+        X: ArrayLike | None = None,
         *,
-        sd: ArrayLike | None = None,
-        sd_angle: ArrayLike | None = None,
+        sd: ScalarLike | None = None,
+        sd_angle: ScalarLike | None = None,
         labels: Sequence[str] | None = None,
         name: str = "poses",
     ):
@@ -305,10 +305,10 @@ class Curvatures(Observation):
 
     def __init__(
         self,
-        curvature: ArrayLike | Sequence,
-        X: ArrayLike | Sequence,
+        curvature: ArrayLike,
+        X: ArrayLike,
         *,
-        sd: ArrayLike | Sequence | None = None,
+        sd: ArrayLike | None = None,
         labels: Sequence[str] | None = None,
         name: str = "curvatures",
     ):
@@ -351,10 +351,10 @@ class Tensions(Observation):
 
     def __init__(
         self,
-        tension: ArrayLike | Sequence,
+        tension: ArrayLike,
         actuators: Sequence[int] | int,
         *,
-        sd: ArrayLike | Sequence | None = None,
+        sd: ArrayLike | None = None,
         name: str = "tensions",
     ):
         self.value = _values(f"{name}.tension", tension, ())[..., None]

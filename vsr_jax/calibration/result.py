@@ -172,7 +172,7 @@ class Fit:
         """The calibrated scene with the base pose of a series."""
         return self._set_up(series)[0]
 
-    def inputs(self, recorded: ArrayLike | Sequence) -> Array:
+    def inputs(self, recorded: ArrayLike) -> Array:
         """Inputs of the calibrated scene for recorded ones, by the gains and offsets that were
         found; shape (actuators,) or (shapes, actuators)."""
         given = numbers("recorded", recorded, None).astype(self.problem.data.inputs.dtype)
@@ -189,7 +189,7 @@ class Fit:
         )
 
     def predict(
-        self, recorded: ArrayLike | Sequence, X: int | VectorLike = 13, series: str | None = None
+        self, recorded: ArrayLike, X: int | VectorLike = 13, series: str | None = None
     ) -> Prediction:
         """Positions on the axis for new inputs, with the uncertainty that the data leave.
 

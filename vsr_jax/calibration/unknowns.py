@@ -10,10 +10,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jax.typing import ArrayLike
 
 from ..arm.scene import Scene
 from ..arm.scene_numbers import matching, parameters
+from ..typing import ArrayLike
 from ..validation import numbers
 from .measurements import Measurements
 
@@ -35,9 +35,9 @@ class Unknown(NamedTuple):
     - `shared`: whether all numbers that match the name have one value.
     """
 
-    low: ArrayLike | Sequence
-    high: ArrayLike | Sequence
-    prior: tuple[ArrayLike | Sequence, ArrayLike | Sequence] | None = None
+    low: ArrayLike
+    high: ArrayLike
+    prior: tuple[ArrayLike, ArrayLike] | None = None
     shared: bool = False
 
 

@@ -122,7 +122,7 @@ def export(
     dxf: PathLike | None = None,
     holes: PathLike | None = None,
     lengths: PathLike | None = None,
-    bore: ArrayLike | Sequence[float | None] | None = None,
+    bore: ArrayLike | None = None,
     wall: float = LEAST_WALL,
     discs: VectorLike = DISCS,
     tolerance: float = TOLERANCE,
@@ -168,7 +168,7 @@ def export(
 def fabrication_of(
     arm: Scene | Equilibrium,
     *,
-    bore: ArrayLike | Sequence[float | None] | None = None,
+    bore: ArrayLike | None = None,
     wall: float = LEAST_WALL,
     discs: VectorLike = DISCS,
     tolerance: float = TOLERANCE,
@@ -209,9 +209,7 @@ def _solved(arm: Scene | Equilibrium) -> Equilibrium:
     return eq
 
 
-def _given_bores(
-    scene: Scene, bore: ArrayLike | Sequence[float | None] | None
-) -> Float[np.ndarray, " threads"]:
+def _given_bores(scene: Scene, bore: ArrayLike | None) -> Float[np.ndarray, " threads"]:
     """Diameters [m] that are given, by the caller or by a chamber's area; NaN for the others."""
     number = len(scene.actuators)
     known = np.asarray(bore).tolist() if isinstance(bore, np.ndarray | Array) else bore

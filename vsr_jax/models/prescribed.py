@@ -7,7 +7,6 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..arm.scene import CrossSections, Scene
@@ -29,7 +28,7 @@ from ..numerics.implicit import implicit_root
 from ..numerics.magnus import ORDERS, accumulate_jacobian
 from ..numerics.newton import Evaluation, Root, newton
 from ..numerics.quadrature import make_grid, onto
-from ..typing import Scalar
+from ..typing import Scalar, ScalarLike
 from ..validation import ROUNDING, choice, count, instance, on_arm
 from . import prescribed_loaded
 from .base import Nodes, Outcome, Status, SteppedModel, classify
@@ -278,7 +277,7 @@ def jacobian(
     scene: Scene,
     basis: AbstractBasis,
     q: Float[Array, " dofs"],
-    X: ArrayLike | None = None,
+    X: ScalarLike | None = None,
     *,
     steps: int = 32,
     order: int = 6,

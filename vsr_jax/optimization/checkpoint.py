@@ -2,7 +2,6 @@
 resumes."""
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ import optax
 
 from ..files.output import replacing
 from ..numerics.fingerprint import fingerprint
+from ..typing import PathLike
 from .descent import DescentState, DesignProblem, History, first_update
 
 
@@ -28,7 +28,7 @@ class Checkpoint:
 
     def __init__(
         self,
-        path: str | os.PathLike | None,
+        path: PathLike | None,
         problem: DesignProblem,
         optimizer: optax.GradientTransformationExtraArgs,
         settings: tuple[int, ...],

@@ -27,7 +27,6 @@ learning_rate = 0.05
 """
 
 import tomllib
-from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,6 +34,7 @@ from ..analysis import constraint
 from ..analysis.constraint import Constraint
 from ..arm.scene import Scene
 from ..files.scene_file import build, kind_of, load, parse_table
+from ..typing import PathLike
 from ..validation import instance
 from . import objective
 from .objective import Objective
@@ -78,7 +78,7 @@ class DesignFile(NamedTuple):
     search: Search
 
 
-def load_design(path: str | PathLike[str]) -> DesignFile:
+def load_design(path: PathLike) -> DesignFile:
     """Reads a design problem from a TOML file.
 
     **Raises:** a one-line `ValueError` that begins with the file's name, as `load`.

@@ -7,7 +7,6 @@ Every evaluation solves the scene for several sets of inputs. The derivatives ar
 derivatives of the equilibria.
 """
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -16,7 +15,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 from tqdm import tqdm
 
@@ -26,7 +24,7 @@ from ..arm.scene import Scene
 from ..arm.scene_numbers import parameters
 from ..models.base import Model
 from ..numerics.compiling import messages
-from ..typing import Scalar
+from ..typing import ArrayLike, PathLike, Scalar
 from ..validation import instance, is_traced
 from .checkpoint import Checkpoint
 from .descent import (
@@ -123,13 +121,13 @@ def design(
     scene: Scene,
     free: Mapping[str, Bounds],
     objective: Objective | Callable[[Arms], Scalar],
-    inputs: ArrayLike | Sequence,
+    inputs: ArrayLike,
     *,
     constraints: Sequence[Constraint] = (),
     uncertain: Mapping[str, float] | None = None,
     model: Model | None = None,
     search: Search | None = None,
-    out: str | os.PathLike | None = None,
+    out: PathLike | None = None,
     progress: bool = True,
 ) -> Design:
     r"""Numbers of a scene that minimise an objective: routings, tapers, moduli, lengths, rest

@@ -5,19 +5,18 @@ objective of a function of `Arms`.
 """
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..analysis.arms import Arms
 from ..analysis.derivatives import compliance
 from ..numerics.se3 import rotation_vector
 from ..solution.equilibrium import Equilibrium
-from ..typing import Scalar
+from ..typing import ArrayLike, Scalar, ScalarLike
 from ..validation import concrete, instance, numbers, on_arm, positive, rigid
 
 
@@ -38,7 +37,7 @@ class Objective(eqx.Module):
     def __add__(self, other: "Objective") -> "Objective":
         return Sum((self, instance("objective", other, Objective, "another objective to add")))
 
-    def __mul__(self, factor: ArrayLike) -> "Objective":
+    def __mul__(self, factor: ScalarLike) -> "Objective":
         return Weighted(numbers("objective's factor", factor), self)
 
     __rmul__ = __mul__
@@ -93,7 +92,7 @@ class TipError(Objective):
 
     targets: Array
 
-    def __init__(self, targets: ArrayLike | Sequence):
+    def __init__(self, targets: ArrayLike):
         self.targets = numbers("TipError.targets", targets, None)
         if self.targets.shape[1:] not in ((3,), (4, 4)):
             raise ValueError(
@@ -141,8 +140,8 @@ class CurveError(Objective):
 
     def __init__(
         self,
-        points: ArrayLike | Sequence,
-        X: ArrayLike | Sequence | None = None,
+        points: ArrayLike,
+        X: ArrayLike | None = None,
         *,
         local: bool = False,
     ):
@@ -214,7 +213,7 @@ class TipCompliance(Objective):
 
     direction: Float[Array, "3"] | None
 
-    def __init__(self, direction: ArrayLike | Sequence | None = None):
+    def __init__(self, direction: ArrayLike | None = None):
         self.direction = (
             None if direction is None else numbers("TipCompliance.direction", direction, (3,))
         )

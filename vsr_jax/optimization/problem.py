@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..analysis.arms import Arms
@@ -17,7 +16,7 @@ from ..arm.scene_numbers import matching, parameters, replaced
 from ..models.base import Model
 from ..models.strain_dependent import StrainDependent
 from ..solution.solver import outcome_of
-from ..typing import Scalar, cast
+from ..typing import ArrayLike, Scalar, cast
 from ..validation import instance, instances, numbers, positive
 from .descent import DesignProblem, Numbers
 from .objective import Measure, Objective
@@ -28,7 +27,7 @@ INPUTS = "inputs"
 _DRAWS = 8
 """Scenes over which an uncertain objective is averaged: four draws, each with its opposite."""
 
-Bounds = Sequence[ArrayLike | Sequence] | None
+Bounds = Sequence[ArrayLike] | None
 """Least and greatest value of a number; None for a phase without bounds."""
 
 
@@ -78,7 +77,7 @@ def formulate(
     scene: Scene,
     free: Mapping[str, Bounds],
     objective: Objective | Callable[[Arms], Scalar],
-    inputs: ArrayLike | Sequence,
+    inputs: ArrayLike,
     constraints: Sequence[Constraint],
     uncertain: Mapping[str, float],
     model: Model | None,
@@ -111,7 +110,7 @@ def formulate(
     return DesignProblem(low, high, terms), terms, given
 
 
-def _sets(scene: Scene, inputs: ArrayLike | Sequence) -> Float[Array, "sets inputs"]:
+def _sets(scene: Scene, inputs: ArrayLike) -> Float[Array, "sets inputs"]:
     sets = numbers("inputs", inputs, None, finite=False)
     if sets.ndim != 2 or not len(sets):
         raise ValueError(

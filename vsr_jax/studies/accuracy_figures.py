@@ -3,12 +3,12 @@
 from collections.abc import Mapping, Sequence
 
 import matplotlib.pyplot as plt
-from jax.typing import ArrayLike
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator
 
+from ..typing import VectorLike
 from ..validation import choice
 from .accuracy import AccuracyRow
 
@@ -34,7 +34,7 @@ _LEAST = 1e-16
 """Smallest error that is drawn: a logarithmic axis has no zero."""
 
 
-Curve = tuple[Sequence[float] | ArrayLike, Sequence[float] | ArrayLike]
+Curve = tuple[VectorLike, VectorLike]
 """Times [us] and errors."""
 
 

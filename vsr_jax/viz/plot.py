@@ -9,7 +9,6 @@ from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
-from jax.typing import ArrayLike
 from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 from matplotlib.colors import LogNorm
@@ -22,7 +21,7 @@ from ..arm.obstacles import Obstacle
 from ..arm.rod import STRAINS
 from ..solution.equilibrium import Equilibrium
 from ..solution.summary import Summary
-from ..typing import VectorLike
+from ..typing import ArrayLike, VectorLike
 from ..validation import choice
 from . import annotate
 from .body import body_of, draw_body, sample, thread_scales
@@ -227,7 +226,7 @@ def workspace(
     positions: ArrayLike,
     ax: Sequence[Axes] | np.ndarray | None = None,
     *,
-    values: ArrayLike | None = None,
+    values: VectorLike | None = None,
     label: str = "",
     color: ColorType = COLORS[0],
     most: int = 20_000,

@@ -1,12 +1,10 @@
 """Figures of a design: history of the objective, the arm before and after."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import jax
 import matplotlib.pyplot as plt
 import numpy as np
-from jax.typing import ArrayLike
 from matplotlib.axes import Axes
 from mpl_toolkits.mplot3d import Axes3D
 
@@ -15,6 +13,7 @@ from ..models.base import Model
 from ..optimization.design_search import Design
 from ..optimization.objective import CurveError, Objective, TipError
 from ..solution.solver import solve
+from ..typing import ArrayLike
 from . import annotate, plot
 from .space import checked_space, equal_scale, fit_height
 from .style import COLORS, ink
@@ -50,7 +49,7 @@ def history(design: Design, ax: Axes | None = None) -> Axes:
 def before_after(
     scene: Scene,
     design: Design,
-    inputs: ArrayLike | Sequence,
+    inputs: ArrayLike,
     ax: Axes3D | None = None,
     *,
     model: Model | None = None,
