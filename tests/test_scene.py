@@ -1,4 +1,6 @@
-"""Scenes and inputs: what is refused, and what rest strain and base do."""
+"""Scenes and inputs: what is refused, which numbers are taken, and what rest strain and base do."""
+
+import inspect
 
 import jax
 import jax.numpy as jnp
@@ -43,6 +45,79 @@ def test_inputs_become_thread_forces():
 def test_bad_inputs_are_named(inputs, message):
     with pytest.raises(ValueError, match=message):
         vsr.solve(SCENE, inputs)
+
+
+BENT = vsr.Rod(
+    0.5,
+    vsr.Joined([0.1], [vsr.Circular(lambda X: 0.01), vsr.Elliptic(0.01, vsr.Taper(0.01, 0.009))]),
+    vsr.Material(1e6, poisson=0.5, density=1e3),
+    rest_strain=lambda X: (0.0, X, 0.0, 1.0, 0.0, 0.0),
+    rigid=vsr.RigidPiece(0.4),
+    guide_radius=0.03,
+)
+SMOOTH, FORWARD = vsr.Spline([0.0, 0.2, 0.5], [0.0, 0.01, 0.0], [0.0, 0.0, 0.0]), [1.0, 0.0, 0.0]
+PARTS = [
+    *(vsr.Parallel(0.01, 0.0), vsr.Linear(0.01, 0.0, 0.1), vsr.Helix(0.01, 1.5), SMOOTH),
+    *(vsr.Polynomial([0.01], [0.0, 0.1]), vsr.Function(lambda X: (0.01, X))),
+    *(vsr.Constant(1.0), vsr.Taper(1.0, 2.0), vsr.PolynomialProfile([1.0, 2.0])),
+    *(vsr.Piecewise([0.1], [1.0, lambda X: 2.0]), vsr.SplineProfile([0.0, 0.5], [1.0, 2.0])),
+    *(vsr.Annular(0.01, 0.005), vsr.Rectangular(0.01, 0.02), BENT.section, BENT.material, BENT),
+    *(BENT.rigid[0], vsr.Scene(BENT, SCENE.actuators, [vsr.DistributedWrench(FORWARD)])),
+    *(
+        vsr.Tendon(SMOOTH, end=0.4),
+        vsr.Tendon(SMOOTH, discs=3),
+        vsr.Tendon(SMOOTH, control="length"),
+    ),
+    *(vsr.Tendon(SMOOTH, disc_places=[0.1]), vsr.Thread(SMOOTH), vsr.Chamber(SMOOTH, area=1e-5)),
+    *(vsr.Gravity(), vsr.DistributedWrench(lambda X: (X, 0.0, 0.0)), vsr.TipWrench(FORWARD)),
+    *(vsr.Spring(FORWARD, 1.0), vsr.Payload(0.1), vsr.Spinning(FORWARD)),
+    *(vsr.MagneticMoment(FORWARD, lambda r: r), vsr.MagneticDensity(lambda X: (X, 0, 0), FORWARD)),
+    *(
+        vsr.Gravity().scaled(2),
+        vsr.Payload(0.1).scaled(2),
+        vsr.Held(position=FORWARD, along=FORWARD),
+    ),
+    *(
+        vsr.Plane(FORWARD),
+        vsr.Sphere(FORWARD, 0.1),
+        vsr.Cylinder(0.1),
+        vsr.Cylinder(0.1, length=1.0),
+    ),
+    *(vsr.Box(FORWARD[:1] * 3), vsr.Field(lambda r: 1), vsr.Tube(0.1)),
+    vsr.Tube(lambda s: 0.1, [[0.0, 0.0, 0.0], [0.3, 0.1, 0.0], FORWARD], pose=vsr.pose()),
+    *(vsr.Monomial(2), vsr.Legendre(2), vsr.Trigonometric(2.0), vsr.PiecewiseConstant(3)),
+    *(vsr.Functions(lambda X: (1, X), size=2), vsr.Basis({"torsion": vsr.Legendre(1)})),
+    vsr.FunctionBasis(lambda X: [[1, X]] * 6, size=2),
+]
+NUMBERS = {
+    **{"X": 0.1, "length": 0.5, "y": 0.001, "z": 0.0, "angle": 1.0, "value": 2.0, "factor": 0.5},
+    **{"point": [0.1, 0.0, 0.2], "position": (0.1, 0.0, 0.2), "heading": FORWARD},
+    **{"lengths": [0.1, 0.2], "inputs": [1.0, 2.0, 3.0], "rotation": np.eye(3).tolist()},
+    **{"axes": np.eye(3).tolist(), "rod": BENT, "frame": "world"},
+}
+INTEGERS = {
+    **NUMBERS,
+    **{"X": 0, "length": 1, "y": 0, "z": 0, "angle": 1, "value": 2, "factor": 2},
+    **{"point": [1, 0, 2], "position": (1, 0, 2), "heading": [1, 0, 0], "lengths": [1, 2]},
+    **{"inputs": [1, 2, 3], "rotation": np.eye(3, dtype=int).tolist()},
+}
+
+
+@pytest.mark.parametrize("part", PARTS, ids=lambda part: type(part).__name__)
+@pytest.mark.parametrize("numbers", [NUMBERS, INTEGERS], ids=["floats", "integers"])
+def test_methods_take_numbers_of_python(part, numbers):
+    """All methods of numbers, places and inputs return what they return for arrays."""
+
+    def shapes(method, *arguments):
+        found = jax.eval_shape(lambda: method(part, *arguments))
+        return jax.tree.map(lambda x: (x.shape, x.dtype), found)
+
+    for name, method in inspect.getmembers(type(part), inspect.isfunction):
+        takes = [x for x in inspect.signature(method).parameters if x != "self"]
+        if name in ("__call__", name.lstrip("_")) and takes and {*takes} <= {*numbers}:
+            given = [numbers[x] for x in takes]
+            arrays = [x if isinstance(x, vsr.Rod | str) else jnp.asarray(x, float) for x in given]
+            assert shapes(method, *given) == shapes(method, *arrays), name
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.conftest import epsilon
-from vsr_jax.numerics import se3
+from vsr_jax.numerics import se3, step_twist, zanna_step
 
 AXIS = np.array([1.0, 2.0, 2.0]) / 3
 ANGLES = (0.0, 1e-12, 1e-8, 1e-4, 1e-2, 0.5, 1.0, 1.99, 2.01, 3.0, np.pi, 6.0)
@@ -158,3 +158,24 @@ def test_a_pose_is_put_together_from_arrays_or_components(batch):
     np.testing.assert_array_equal(found[..., :3, 3], jnp.moveaxis(r, 0, -1))
     np.testing.assert_array_equal(found[..., 3, :], np.broadcast_to([0, 0, 0, 1], (*batch, 4)))
     np.testing.assert_array_equal(se3.pose(tuple(map(tuple, R)), tuple(r)), found)
+
+
+@pytest.mark.parametrize("kernel", [se3.exp, se3.hat, se3.ad, se3.coad, se3.skew])
+def test_twists_may_be_lists(kernel):
+    vector = [0.0, 0.1, 0.2, 1, 0, 0][: 3 if kernel is se3.skew else 6]
+    assert jax.eval_shape(lambda: kernel(vector)) == jax.eval_shape(kernel, jnp.asarray(vector))
+
+
+@pytest.mark.parametrize(
+    "kernel", [se3.inverse, se3.vee, se3.adjoint, se3.coadjoint, se3.nearest_pose]
+)
+def test_poses_may_be_lists(kernel):
+    g = np.eye(4).tolist()
+    assert jax.eval_shape(lambda: kernel(g)) == jax.eval_shape(kernel, jnp.asarray(g))
+
+
+def test_steps_may_be_of_lists():
+    low, high = [0.0, 1.0, 0.0, 1.0, 0.0, 0.0], [0.0, 2.0, 0.0, 1.0, 0.0, 0.0]
+    found = jax.eval_shape(lambda: zanna_step(low, high, 1))
+    assert found == jax.eval_shape(lambda: step_twist([low, high], 1.0))
+    assert (found.shape, found.dtype) == ((6,), jnp.float64)

@@ -194,7 +194,7 @@ def test_compliance_under_loads_and_of_a_basis(eq):
 
 def test_ellipsoids(eq):
     J = np.asarray(vsr.tip_jacobian(eq))[3:]
-    found = vsr.manipulability(eq, 2.0)
+    found = vsr.manipulability(eq, [2] * len(J.T))
     np.testing.assert_allclose(found.measure, np.sqrt(np.linalg.det(4 * J @ J.T)), rtol=1e-9)
     np.testing.assert_allclose(found.axes @ found.axes.T, 4 * J @ J.T, atol=1e-12)
     np.testing.assert_allclose(found.centre, eq.tip[:3, 3])

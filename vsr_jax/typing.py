@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Real
 from typing_extensions import TypeAliasType
 
@@ -18,7 +19,7 @@ Scalar = Float[Array, ""]
 Twist = Float[Array, "6"]
 Pose = Float[Array, "4 4"]
 
-ScalarLike = TypeAliasType("ScalarLike", Real[jax.typing.ArrayLike, ""])
+ScalarLike = TypeAliasType("ScalarLike", Real[Array | np.ndarray | np.number | float | int, ""])
 """A real number: of Python, NumPy or JAX."""
 
 VectorLike = TypeAliasType("VectorLike", jax.typing.ArrayLike | Sequence[ScalarLike])
@@ -40,9 +41,9 @@ Tree = TypeVar("Tree")
 
 
 def real(value: ArrayLike) -> Array:
-    """`value` as a floating-point array. Numbers of Python and integers take the precision of what
+    """`value` as a floating-point array; a number of Python, or integers, in the precision of what
     they are combined with."""
-    array = jnp.asarray(value)
+    array = value if isinstance(value, Array) else jnp.asarray(value)
     return array if jnp.issubdtype(array.dtype, jnp.floating) else 1.0 * array
 
 

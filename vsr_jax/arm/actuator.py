@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..typing import Scalar, ScalarLike, VectorLike
+from ..typing import Scalar, ScalarLike, VectorLike, real
 from ..validation import choice, concrete, count, instance, numbers
 from .description import Part
 from .routing import Routing
@@ -76,9 +76,10 @@ class Actuator(Part):
         """Number of the thread's discs, if they are evenly spaced over the whole arm."""
         return None
 
-    def holes(self, length: Scalar) -> Float[Array, " holes"]:
+    def holes(self, length: ScalarLike) -> Float[Array, " holes"]:
         """Abscissas [m], ascending, of the holes between which the thread of an arm of `length` [m]
         runs: its two ends, and its discs where it is `straight`."""
+        length = real(length)
         start = jnp.zeros_like(length) if self.start is None else self.start
         return jnp.stack([start, length if self.end is None else self.end])
 
@@ -88,7 +89,7 @@ class Actuator(Part):
         return (self.effect,)
 
     @abstractmethod
-    def force(self, value: Scalar) -> Scalar:
+    def force(self, value: ScalarLike) -> Scalar:
         """Signed thread force $\\tau$ [N] for an input."""
 
     @property
@@ -97,7 +98,7 @@ class Actuator(Part):
         ends = tuple(x for x in (self.start, self.end) if x is not None)
         return (*self.routing.breakpoints, *ends)
 
-    def reach(self, X: Scalar) -> Array | None:
+    def reach(self, X: ScalarLike) -> Array | None:
         """1 between the thread's ends, 0 elsewhere; None if it extends over the whole arm."""
         if self.start is None and self.end is None:
             return None
@@ -142,8 +143,8 @@ class Thread(Actuator):
     def unit(self) -> str:
         return "N"
 
-    def force(self, value: Scalar) -> Scalar:
-        return value
+    def force(self, value: ScalarLike) -> Scalar:
+        return real(value)
 
 
 class Tendon(Actuator):
@@ -288,11 +289,11 @@ class Tendon(Actuator):
     def even_discs(self) -> int | None:
         return self.discs if self.start is None and self.end is None else None
 
-    def holes(self, length: Scalar) -> Float[Array, " holes"]:
+    def holes(self, length: ScalarLike) -> Float[Array, " holes"]:
         start, end = super().holes(length)
         if self.disc_places is not None:
             return jnp.concatenate([start[None], self.disc_places, end[None]])
-        share = jnp.arange(1 + (self.discs or 1), dtype=length.dtype) / (self.discs or 1)
+        share = jnp.arange(1 + (self.discs or 1), dtype=end.dtype) / (self.discs or 1)
         return start + (end - start) * share
 
     @property
@@ -305,8 +306,9 @@ class Tendon(Actuator):
         )
         return (self.effect, *(name for name, present in options if present))
 
-    def force(self, value: Scalar) -> Scalar:
+    def force(self, value: ScalarLike) -> Scalar:
         """$\\tau = -T$; zero, the first iterate, for a tendon driven by its length."""
+        value = real(value)
         return -value if self.control == "tension" else jnp.zeros_like(value)
 
 
@@ -345,5 +347,5 @@ class Chamber(Actuator):
     def pressure_area(self) -> Scalar:
         return self.area
 
-    def force(self, value: Scalar) -> Scalar:
-        return value * self.area
+    def force(self, value: ScalarLike) -> Scalar:
+        return real(value) * self.area

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..typing import MatrixLike, Scalar, ScalarLike, VectorLike
+from ..typing import MatrixLike, Scalar, ScalarLike, VectorLike, real
 from ..validation import is_traced, numbers, rigid
 from .description import Part
 from .rod import Rod
@@ -62,11 +62,12 @@ class Held(Part):
         """Abscissa [m]."""
         return rod.length if self.X is None else self.X
 
-    def directions(self, axes: Float[Array, "3 3"]) -> Float[Array, "3 forces"] | None:
+    def directions(self, axes: MatrixLike) -> Float[Array, "3 forces"] | None:
         """Unit vectors of the world in which its position is held, along `axes` where it can be;
         None if it may move."""
         if self.position is None:
             return None
+        axes = real(axes)
         if self.along is None:
             return axes
         a = self.along / jnp.sqrt(jnp.sum(self.along**2))

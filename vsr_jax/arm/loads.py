@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..numerics.component import Vector3, Wrench, scale, split
-from ..typing import Scalar, ScalarLike, VectorLike
+from ..typing import Scalar, ScalarLike, VectorLike, real
 from ..validation import choice, numbers
 from .description import Part
 from .profile import ProfilesLike, ProfileVector, as_profiles, breakpoints_of, values_at
@@ -37,7 +37,7 @@ class Load(Part):
     def check(self, rod: Rod) -> None:
         """Raises `ValueError` if the load cannot act on `rod`. A scene calls this once."""
 
-    def density(self, rod: Rod, X: Scalar) -> Wrench | None:
+    def density(self, rod: Rod, X: ScalarLike) -> Wrench | None:
         """Wrench per length $(c, f)$ at X, six scalars; None for a load at a point."""
         return None
 
@@ -54,7 +54,7 @@ class Load(Part):
         """Abscissas [m] where the load or a derivative of it jumps."""
         return ()
 
-    def scaled(self, factor: Scalar) -> "Load":
+    def scaled(self, factor: ScalarLike) -> "Load":
         """The load times a factor."""
         return _ScaledLoad(self, factor)
 
@@ -65,10 +65,10 @@ class _ScaledLoad(Load):
     frame: Frame = eqx.field(static=True)
     effect = "scaled load"
 
-    def __init__(self, load: Load, factor: Scalar):
-        self.load, self.factor, self.frame = load, factor, load.frame
+    def __init__(self, load: Load, factor: ScalarLike):
+        self.load, self.factor, self.frame = load, real(factor), load.frame
 
-    def density(self, rod: Rod, X: Scalar) -> Wrench | None:
+    def density(self, rod: Rod, X: ScalarLike) -> Wrench | None:
         whole = self.load.density(rod, X)
         return None if whole is None else scale(self.factor, whole)
 
@@ -89,7 +89,7 @@ def need_density(load: Load, rod: Rod) -> None:
         )
 
 
-def mass_per_length(rod: Rod, X: Scalar, displaced: Scalar | None = None) -> Scalar:
+def mass_per_length(rod: Rod, X: ScalarLike, displaced: Scalar | None = None) -> Scalar:
     """Mass per reference length [kg/m], less that of a displaced fluid of a given density."""
     assert rod.material.density is not None  # see need_density
     density = rod.material.density(X, rod.length)
@@ -132,7 +132,7 @@ class Gravity(Load):
     def check(self, rod: Rod) -> None:
         need_density(self, rod)
 
-    def density(self, rod: Rod, X: Scalar) -> Wrench:
+    def density(self, rod: Rod, X: ScalarLike) -> Wrench:
         weight = mass_per_length(rod, X, self.fluid_density)
         zero = jnp.zeros_like(weight)
         x, y, z = (weight * g for g in self.acceleration)
@@ -227,7 +227,7 @@ class DistributedWrench(Load):
         )
         self.frame = choice("DistributedWrench.frame", frame, ("world", "body"))
 
-    def density(self, rod: Rod, X: Scalar) -> Wrench:
+    def density(self, rod: Rod, X: ScalarLike) -> Wrench:
         mx, my, mz = values_at(self.moment, X, rod.length)
         fx, fy, fz = values_at(self.force, X, rod.length)
         return mx, my, mz, fx, fy, fz

@@ -5,7 +5,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from ..numerics.component import Vector
-from ..typing import Scalar
+from ..typing import Scalar, ScalarLike
 from .description import Part
 from .profile import Limits, Profile, ProfileLike, as_profile
 from .section import Section
@@ -51,14 +51,14 @@ class Material(Part):
             None if density is None else as_profile("Material.density", density, positive=True)
         )
 
-    def shear_modulus(self, X: Scalar, length: Scalar) -> Scalar:
+    def shear_modulus(self, X: ScalarLike, length: ScalarLike) -> Scalar:
         """Shear modulus $G$ [Pa] at X [m]."""
         if self.shear is not None:
             return self.shear(X, length)
         assert self.poisson is not None
         return self.young(X, length) / (2 + 2 * self.poisson(X, length))
 
-    def limits(self, X: Scalar, length: Scalar) -> Limits:
+    def limits(self, X: ScalarLike, length: ScalarLike) -> Limits:
         """The properties at X [m] and their limits."""
         given = {
             name: p
@@ -73,7 +73,7 @@ class Material(Part):
             found["poisson", f"a ratio > {LEAST_POISSON:g} and <= {MOST_POISSON:g}"] = ratio, room
         return found
 
-    def stiffness(self, section: Section, X: Scalar, length: Scalar) -> Vector:
+    def stiffness(self, section: Section, X: ScalarLike, length: ScalarLike) -> Vector:
         """Diagonal of $\\Sigma(X)$, six scalars [N m^2] and [N]."""
         shape, E, G = (
             section.geometry(X, length),

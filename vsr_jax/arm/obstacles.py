@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..numerics.component import dot, join, norm, split
-from ..typing import MatrixLike, Pose, Scalar, ScalarLike, VectorLike
+from ..typing import MatrixLike, Pose, Scalar, ScalarLike, VectorLike, real
 from ..validation import concrete, numbers, rigid
 from .description import Part
 from .functions import Position, function_of_position
@@ -40,7 +40,7 @@ class Obstacle(Part):
     lies_along: ClassVar[bool] = False
 
     @abstractmethod
-    def distance(self, point: Position) -> Scalar:
+    def distance(self, point: VectorLike) -> Scalar:
         """Signed distance [m] from the surface to a point of the world: positive outside, where the
         arm may be. One point at a time; for several use `jax.vmap`."""
 
@@ -56,7 +56,7 @@ class Obstacle(Part):
         return None
 
     def directions(
-        self, point: Position, heading: Position, lengths: Float[Array, " steps"]
+        self, point: VectorLike, heading: VectorLike, lengths: VectorLike
     ) -> Float[Array, "steps 3"] | None:
         """Unit vectors along the middle of one that encloses the arm, after steps of some lengths
         [m] from the place nearest to a point, in the direction that is nearer to a heading; None
@@ -71,8 +71,9 @@ class Obstacle(Part):
         """
 
 
-def local_point(pose: Pose | None, point: Position) -> Position:
+def local_point(pose: Pose | None, point: VectorLike) -> Position:
     """A point of the world in the axes of a pose, $R^T (p - r)$; None is the identity."""
+    point = real(point)
     if pose is None:
         return point
     apart = split(point - pose[:3, 3])
@@ -126,9 +127,9 @@ class Plane(Obstacle):
         if known is not None and not known.any():
             raise ValueError(f"Plane.normal: got {normal!r}, need a direction, not zeros")
 
-    def distance(self, point: Position) -> Scalar:
+    def distance(self, point: VectorLike) -> Scalar:
         normal = split(self.normal)
-        return dot(normal, split(point - self.point)) / norm(normal)
+        return dot(normal, split(real(point) - self.point)) / norm(normal)
 
     @property
     def sizes(self) -> dict[str, Array]:
@@ -153,8 +154,8 @@ class Sphere(Obstacle):
         self.centre = numbers("Sphere.centre", centre, (3,))
         self.radius = numbers("Sphere.radius", radius, positive=True)
 
-    def distance(self, point: Position) -> Scalar:
-        return norm(split(point - self.centre)) - self.radius
+    def distance(self, point: VectorLike) -> Scalar:
+        return norm(split(real(point) - self.centre)) - self.radius
 
     @property
     def sizes(self) -> dict[str, Array]:
@@ -189,7 +190,7 @@ class Cylinder(Obstacle):
         self.length = None if length is None else numbers("Cylinder.length", length, positive=True)
         self.pose = _pose("Cylinder.pose", pose)
 
-    def distance(self, point: Position) -> Scalar:
+    def distance(self, point: VectorLike) -> Scalar:
         x, y, z = split(local_point(self.pose, point))
         around = norm((y, z)) - self.radius
         if self.length is None:
@@ -231,7 +232,7 @@ class Box(Obstacle):
         most = jnp.inf if known is None else float(known.min()) / 2
         self.rounding = numbers("Box.rounding", rounding, least=0.0, most=most)
 
-    def distance(self, point: Position) -> Scalar:
+    def distance(self, point: VectorLike) -> Scalar:
         inner = 0.5 * self.size - self.rounding
         return _distance_beyond(jnp.abs(local_point(self.pose, point)) - inner) - self.rounding
 
@@ -271,5 +272,6 @@ class Field(Obstacle):
                 f"{f'shape {found}' if len(shapes) == 1 else found}, need a scalar"
             )
 
-    def distance(self, point: Position) -> Scalar:
+    def distance(self, point: VectorLike) -> Scalar:
+        point = real(point)
         return jnp.asarray(self.function(point), point.dtype)

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from typing_extensions import TypeAliasType
 
 from ..numerics.stacked import cross, dot, matmul, matvec, skew
-from ..typing import Scalar, ScalarLike, Twist, VectorLike
+from ..typing import MatrixLike, Scalar, ScalarLike, Twist, VectorLike, real
 from ..validation import choice, numbers
 from .functions import Position, function_of_position
 from .loads import THREE_PROFILES, Frame, Load, mass_per_length, need_density
@@ -66,27 +66,28 @@ class PoseLoad(Load):
         return None
 
     def potential(
-        self, rod: Rod, X: Scalar, rotation: Rotation, position: Position
+        self, rod: Rod, X: ScalarLike, rotation: MatrixLike, position: VectorLike
     ) -> Scalar | None:
         """Potential energy [J], or [J/m] of a load per length, of the section at X; None for a load
         without one."""
         return None
 
-    def wrench(self, rod: Rod, X: Scalar, rotation: Rotation, position: Position) -> Twist:
+    def wrench(self, rod: Rod, X: ScalarLike, rotation: MatrixLike, position: VectorLike) -> Twist:
         """Wrench $(M, F)$ [N m, N], or density $(c, f)$ [N, N/m], in the world frame, of the
         section at X; by default from `potential`."""
+        R, r = real(rotation), real(position)
 
         def energy(turn: Array, shift: Array) -> Array:
-            turned = rotation + matmul(skew(turn), rotation)
-            energy = self.potential(rod, X, turned, position + shift)
+            turned = R + matmul(skew(turn), R)
+            energy = self.potential(rod, X, turned, r + shift)
             if energy is None:
                 raise NotImplementedError(f"{type(self).__name__}: need a potential or a wrench")
             return energy
 
-        zero = jnp.zeros_like(position)
+        zero = jnp.zeros_like(r)
         return -jnp.concatenate(jax.grad(energy, (0, 1))(zero, zero))
 
-    def scaled(self, factor: Scalar) -> Load:
+    def scaled(self, factor: ScalarLike) -> Load:
         return _ScaledPoseLoad(self, factor)
 
 
@@ -95,8 +96,8 @@ class _ScaledPoseLoad(PoseLoad):
     factor: Scalar
     effect = "scaled load"
 
-    def __init__(self, load: PoseLoad, factor: Scalar):
-        self.load, self.factor, self.frame = load, factor, "world"
+    def __init__(self, load: PoseLoad, factor: ScalarLike):
+        self.load, self.factor, self.frame = load, real(factor), "world"
 
     @property
     def needs(self) -> Needs:
@@ -110,12 +111,12 @@ class _ScaledPoseLoad(PoseLoad):
         return self.load.place(rod)
 
     def potential(
-        self, rod: Rod, X: Scalar, rotation: Rotation, position: Position
+        self, rod: Rod, X: ScalarLike, rotation: MatrixLike, position: VectorLike
     ) -> Scalar | None:
         whole = self.load.potential(rod, X, rotation, position)
         return None if whole is None else self.factor * whole
 
-    def wrench(self, rod: Rod, X: Scalar, rotation: Rotation, position: Position) -> Twist:
+    def wrench(self, rod: Rod, X: ScalarLike, rotation: MatrixLike, position: VectorLike) -> Twist:
         return self.factor * self.load.wrench(rod, X, rotation, position)
 
     def breakpoints(self, rod: Rod) -> tuple[Scalar, ...]:
@@ -176,8 +177,10 @@ class Spring(_AtPoint):
         self.kind = choice("Spring.kind", kind, ("both", "cord"))
         self.frame = "world"
 
-    def potential(self, rod: Rod, X: Scalar, rotation: Rotation, position: Position) -> Scalar:
-        apart = position + matvec(rotation, self.offset) - self.anchor
+    def potential(
+        self, rod: Rod, X: ScalarLike, rotation: MatrixLike, position: VectorLike
+    ) -> Scalar:
+        apart = real(position) + matvec(real(rotation), self.offset) - self.anchor
         square = dot(apart, apart)
         away = square > 0  # the distance has no derivative at zero
         stretch = jnp.where(away, jnp.sqrt(jnp.where(away, square, 1.0)), 0.0) - self.length
@@ -227,9 +230,11 @@ class Payload(_AtPoint):
     def needs(self) -> Needs:
         return "rotation"
 
-    def potential(self, rod: Rod, X: Scalar, rotation: Rotation, position: Position) -> Scalar:
+    def potential(
+        self, rod: Rod, X: ScalarLike, rotation: MatrixLike, position: VectorLike
+    ) -> Scalar:
         mass = self.mass - self.fluid_density * self.volume
-        return -mass * dot(self.acceleration, position + matvec(rotation, self.offset))
+        return -mass * dot(self.acceleration, real(position) + matvec(real(rotation), self.offset))
 
 
 class _Magnetic(PoseLoad):
@@ -250,8 +255,8 @@ class _Magnetic(PoseLoad):
                 f"{type(self).__name__}.field: got a function that returns shape {shape}, need (3,)"
             )
 
-    def _energy(self, moment: Array, rotation: Rotation, position: Position) -> Scalar:
-        return -dot(matvec(rotation, moment), self._field_at(position))
+    def _energy(self, moment: Array, rotation: MatrixLike, position: VectorLike) -> Scalar:
+        return -dot(matvec(real(rotation), moment), self._field_at(real(position)))
 
     def _field_at(self, position: Position) -> Array:
         return jnp.asarray(self.field(position) if callable(self.field) else self.field)
@@ -284,7 +289,9 @@ class MagneticMoment(_Magnetic, _AtPoint):
         self.X = _abscissa("MagneticMoment.X", X)
         self.frame = "world"
 
-    def potential(self, rod: Rod, X: Scalar, rotation: Rotation, position: Position) -> Scalar:
+    def potential(
+        self, rod: Rod, X: ScalarLike, rotation: MatrixLike, position: VectorLike
+    ) -> Scalar:
         return self._energy(self.moment, rotation, position)
 
 
@@ -308,7 +315,9 @@ class MagneticDensity(_Magnetic):
         self.field = _field("MagneticDensity.field", field)
         self.frame = "world"
 
-    def potential(self, rod: Rod, X: Scalar, rotation: Rotation, position: Position) -> Scalar:
+    def potential(
+        self, rod: Rod, X: ScalarLike, rotation: MatrixLike, position: VectorLike
+    ) -> Scalar:
         moment = jnp.stack(jnp.broadcast_arrays(*values_at(self.moment, X, rod.length)))
         return self._energy(moment, rotation, position)
 
@@ -339,6 +348,8 @@ class Spinning(PoseLoad):
     def check(self, rod: Rod) -> None:
         need_density(self, rod)
 
-    def potential(self, rod: Rod, X: Scalar, rotation: Rotation, position: Position) -> Scalar:
-        speed = cross(self.rate, position - self.centre)
+    def potential(
+        self, rod: Rod, X: ScalarLike, rotation: MatrixLike, position: VectorLike
+    ) -> Scalar:
+        speed = cross(self.rate, real(position) - self.centre)
         return -0.5 * mass_per_length(rod, X) * dot(speed, speed)

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 from typing_extensions import TypeAliasType
 
-from ..typing import Scalar, ScalarLike, Tree, VectorLike
+from ..typing import Scalar, ScalarLike, Tree, VectorLike, real
 from ..validation import concrete, numbers
 from .description import Part, describe
 from .fields import OF_OWNER
@@ -55,9 +55,11 @@ class FunctionOfX(eqx.Module):
             lambda leaf: jnp.asarray(leaf) if eqx.is_array_like(leaf) else leaf, parameters
         )
 
-    def __call__(self, X: Scalar) -> PyTree:
-        """Value of the function at X [m]."""
-        return self.function(X, *self.parameters)
+    def __call__(self, X: ScalarLike) -> PyTree:
+        """Value of the function at X [m], its numbers as arrays in the precision of X."""
+        X = real(X)
+        value = self.function(X, *self.parameters)
+        return jax.tree.map(lambda number: jnp.asarray(number, X.dtype), value)
 
     def __repr__(self) -> str:
         function, parameters = self.function, self.parameters
@@ -67,7 +69,7 @@ class FunctionOfX(eqx.Module):
         return f"{name}({', '.join(('X', *map(describe, parameters)))})"
 
 
-def _call(X: Scalar, function: Callable, *parameters: PyTree) -> PyTree:
+def _call(X: ScalarLike, function: Callable, *parameters: PyTree) -> PyTree:
     """Value of a function that is itself a parameter."""
     return function(X, *parameters)
 
@@ -76,7 +78,7 @@ class Profile(Part):
     """A scalar function of X on an arm of a given length."""
 
     @abstractmethod
-    def __call__(self, X: Scalar, length: Scalar) -> Scalar:
+    def __call__(self, X: ScalarLike, length: ScalarLike) -> Scalar:
         """Value at X [m]."""
 
     @property
@@ -103,7 +105,7 @@ class Constant(Profile):
     def __init__(self, value: ScalarLike):
         self.value = numbers("Constant.value", value)
 
-    def __call__(self, X: Scalar, length: Scalar) -> Scalar:
+    def __call__(self, X: ScalarLike, length: ScalarLike) -> Scalar:
         return self.value
 
 
@@ -117,8 +119,8 @@ class Taper(Profile):
         self.base = numbers("Taper.base", base)
         self.tip = numbers("Taper.tip", tip)
 
-    def __call__(self, X: Scalar, length: Scalar) -> Scalar:
-        return self.base + (self.tip - self.base) * (X / length)
+    def __call__(self, X: ScalarLike, length: ScalarLike) -> Scalar:
+        return self.base + (self.tip - self.base) * (real(X) / length)
 
 
 class PolynomialProfile(Profile):
@@ -129,7 +131,7 @@ class PolynomialProfile(Profile):
     def __init__(self, coefficients: VectorLike):
         self.coefficients = rising_coefficients("PolynomialProfile.coefficients", coefficients)
 
-    def __call__(self, X: Scalar, length: Scalar) -> Scalar:
+    def __call__(self, X: ScalarLike, length: ScalarLike) -> Scalar:
         return jnp.polyval(self.coefficients[::-1], X)
 
 
@@ -148,7 +150,7 @@ class SplineProfile(Profile):
     def breakpoints(self) -> tuple[Scalar, ...]:
         return spline_breakpoints(self.X)
 
-    def __call__(self, X: Scalar, length: Scalar) -> Scalar:
+    def __call__(self, X: ScalarLike, length: ScalarLike) -> Scalar:
         return spline_value(X, self.X, self.values)
 
 
@@ -170,7 +172,7 @@ class Piecewise(Profile):
             as_profile(f"Piecewise.values[{i}]", value) for i, value in enumerate(values)
         )
 
-    def __call__(self, X: Scalar, length: Scalar) -> Scalar:
+    def __call__(self, X: ScalarLike, length: ScalarLike) -> Scalar:
         return pick(X, self.ends, [value(X, length) for value in self.values])
 
     @property
@@ -202,7 +204,7 @@ def rising_ends(owner: str, ends: VectorLike, parts: Sequence[object]) -> Float[
     return array
 
 
-def pick(X: Scalar, ends: Float[Array, " inner"], values: Sequence[Tree]) -> Tree:
+def pick(X: ScalarLike, ends: Float[Array, " inner"], values: Sequence[Tree]) -> Tree:
     """The item of `values`, numbers or pytrees, for the part that contains X."""
     result = values[-1]
     for i in reversed(range(ends.size)):
@@ -221,8 +223,8 @@ class FunctionProfile(Profile):
     def __init__(self, function: Callable[..., ScalarLike], *parameters: PyTree):
         self.function = FunctionOfX("FunctionProfile", function, *parameters)
 
-    def __call__(self, X: Scalar, length: Scalar) -> Scalar:
-        return jnp.asarray(self.function(X), X.dtype)
+    def __call__(self, X: ScalarLike, length: ScalarLike) -> Scalar:
+        return self.function(X)
 
 
 class _Scaled(Profile):
@@ -231,7 +233,7 @@ class _Scaled(Profile):
     factor: float = eqx.field(static=True)
     profile: Profile = eqx.field(metadata={"unit": OF_OWNER})
 
-    def __call__(self, X: Scalar, length: Scalar) -> Scalar:
+    def __call__(self, X: ScalarLike, length: ScalarLike) -> Scalar:
         return self.factor * self.profile(X, length)
 
     @property
@@ -289,10 +291,10 @@ def as_profiles(name: str, value: ProfilesLike, labels: Sequence[str], need: str
     return tuple(as_profile(label, x) for label, x in zip(labels, value, strict=True))
 
 
-def values_at(profiles: ProfileVector, X: Scalar, length: Scalar) -> tuple[Scalar, ...]:
+def values_at(profiles: ProfileVector, X: ScalarLike, length: ScalarLike) -> tuple[Scalar, ...]:
     """Value of each profile at X [m]."""
     if isinstance(profiles, FunctionOfX):
-        return tuple(jnp.asarray(value, X.dtype) for value in profiles(X))
+        return tuple(profiles(X))
     return tuple(profile(X, length) for profile in profiles)
 
 

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..typing import Scalar, ScalarLike
+from ..typing import ArrayLike, Scalar, ScalarLike, real
 from ..validation import ROUNDING, is_traced, numbers
 from .description import Part
 
@@ -40,23 +40,25 @@ class RigidPiece(Part):
         """Abscissas [m] of its ends on the arm."""
         return tuple(x for x in (self.start, self.end) if x is not None)
 
-    def ends(self, length: float) -> tuple[float, float]:
+    def ends(self, length: ScalarLike) -> tuple[float, float]:
         """Known abscissas of its ends [m] on an arm of a known length."""
         return (
             0.0 if self.start is None else float(self.start),
-            length if self.end is None else float(self.end),
+            float(length if self.end is None else self.end),
         )
 
-    def covers(self, X: Array) -> Array:
+    def covers(self, X: ArrayLike) -> Array:
         """Whether X [m], of any shape, lies on it, the ends included."""
+        X = real(X)
         here = jnp.ones_like(X, bool) if self.start is None else self.start <= X
         return here if self.end is None else here & (self.end >= X)
 
 
-def flexibility(pieces: Sequence[RigidPiece], X: Array) -> Array | None:
+def flexibility(pieces: Sequence[RigidPiece], X: ArrayLike) -> Array | None:
     """0 where X [m], of any shape, lies on a rigid piece and 1 elsewhere; None without pieces."""
     if not pieces:
         return None
+    X = real(X)
     rigid = jnp.any(jnp.stack([piece.covers(X) for piece in pieces]), axis=0)
     return jnp.where(rigid, jnp.zeros_like(X), jnp.ones_like(X))
 

@@ -8,7 +8,7 @@ from jaxtyping import Array
 
 from ..numerics.component import Vector, norm
 from ..numerics.se3 import nearest_pose
-from ..typing import MatrixLike, Pose, Scalar, ScalarLike
+from ..typing import ArrayLike, MatrixLike, Pose, Scalar, ScalarLike, real
 from ..validation import instance, instances, numbers, rigid as rigid_transform
 from .description import Part
 from .material import Material
@@ -97,20 +97,20 @@ class Rod(Part):
         take many more steps, or not be solved."""
         return None if self.base is None else nearest_pose(self.base)
 
-    def rest(self, X: Scalar) -> Vector:
+    def rest(self, X: ScalarLike) -> Vector:
         """Rest strain $\\xi^*$ at X [m], six scalars."""
         return values_at(self.rest_strain, X, self.length)
 
-    def stiffness(self, X: Scalar) -> Vector:
+    def stiffness(self, X: ScalarLike) -> Vector:
         """Diagonal of $\\Sigma$ at X [m], six scalars [N m^2] and [N]."""
         return self.material.stiffness(self.section, X, self.length)
 
-    def flexible(self, X: Array) -> Array | None:
+    def flexible(self, X: ArrayLike) -> Array | None:
         """0 where X [m], of any shape, lies on a rigid piece and 1 elsewhere; None without rigid
         pieces."""
         return flexibility(self.rigid, X)
 
-    def limits(self, X: Scalar) -> Limits:
+    def limits(self, X: ScalarLike) -> Limits:
         """Sizes, material properties and rest elongation at X [m] and their limits."""
         parts = {
             "section": self.section.limits(X, self.length),
@@ -130,16 +130,16 @@ class Rod(Part):
             ),
         }
 
-    def clearance(self, y: Scalar, z: Scalar, X: Scalar) -> Array:
+    def clearance(self, y: ScalarLike, z: ScalarLike, X: ScalarLike) -> Array:
         """Distance [m] from (y, z) to the section's wall or the guide at X: positive inside."""
         inside = self.section.clearance(y, z, X, self.length)
         return (
             inside
             if self.guide_radius is None
-            else jnp.maximum(inside, self.guide_radius - norm((y, z)))
+            else jnp.maximum(inside, self.guide_radius - norm((real(y), real(z))))
         )
 
-    def outline(self, X: Scalar) -> Scalar:
+    def outline(self, X: ScalarLike) -> Scalar:
         """Radius [m] of the round outline of the arm about its axis at X: that of the section, of
         its corners where it is not round, or `guide_radius` if that is greater."""
         radius = self.section.outer_radius(X, self.length)

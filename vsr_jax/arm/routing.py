@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from ..numerics.component import Vector, Vector3
-from ..typing import Scalar, ScalarLike, VectorLike
+from ..typing import Scalar, ScalarLike, VectorLike, real
 from ..validation import choice, numbers
 from .description import Part
 from .profile import FunctionOfX, rising_coefficients
@@ -45,7 +45,7 @@ class Routing(Part):
     """The path of one thread through the sections."""
 
     @abstractmethod
-    def __call__(self, X: Scalar) -> tuple[Scalar, Scalar]:
+    def __call__(self, X: ScalarLike) -> tuple[Scalar, Scalar]:
         """Position $(d_y, d_z)$ [m] at X [m]."""
 
     @property
@@ -53,8 +53,9 @@ class Routing(Part):
         """Abscissas [m] where a derivative of the path jumps."""
         return ()
 
-    def path(self, X: Scalar) -> Path:
+    def path(self, X: ScalarLike) -> Path:
         """Position and slope at X [m]."""
+        X = real(X)
         (y, z), (slope_y, slope_z) = jax.jvp(self, (X,), (jnp.ones_like(X),))
         return Path(y, z, slope_y, slope_z)
 
@@ -69,7 +70,7 @@ class Parallel(Routing):
         self.y = numbers("Parallel.y", y)
         self.z = numbers("Parallel.z", z)
 
-    def __call__(self, X: Scalar) -> tuple[Scalar, Scalar]:
+    def __call__(self, X: ScalarLike) -> tuple[Scalar, Scalar]:
         return self.y, self.z
 
 
@@ -90,7 +91,7 @@ class Linear(Routing):
         self.slope_y = numbers("Linear.slope_y", slope_y)
         self.slope_z = numbers("Linear.slope_z", slope_z)
 
-    def __call__(self, X: Scalar) -> tuple[Scalar, Scalar]:
+    def __call__(self, X: ScalarLike) -> tuple[Scalar, Scalar]:
         return self.y + self.slope_y * X, self.z + self.slope_z * X
 
 
@@ -140,7 +141,7 @@ class Helix(Routing):
         assert self.angle is not None
         return 1 / (self.radius * jnp.tan(self.angle))
 
-    def __call__(self, X: Scalar) -> tuple[Scalar, Scalar]:
+    def __call__(self, X: ScalarLike) -> tuple[Scalar, Scalar]:
         phi = self.phase + (1 if self.hand == "right" else -1) * self.wavenumber * X
         return self.radius * jnp.cos(phi), self.radius * jnp.sin(phi)
 
@@ -156,7 +157,7 @@ class Polynomial(Routing):
         self.y = rising_coefficients("Polynomial.y", y)
         self.z = rising_coefficients("Polynomial.z", z)
 
-    def __call__(self, X: Scalar) -> tuple[Scalar, Scalar]:
+    def __call__(self, X: ScalarLike) -> tuple[Scalar, Scalar]:
         return jnp.polyval(self.y[::-1], X), jnp.polyval(self.z[::-1], X)
 
 
@@ -172,7 +173,7 @@ class Spline(Routing):
         self.y = numbers("Spline.y", y, self.X.shape)
         self.z = numbers("Spline.z", z, self.X.shape)
 
-    def __call__(self, X: Scalar) -> tuple[Scalar, Scalar]:
+    def __call__(self, X: ScalarLike) -> tuple[Scalar, Scalar]:
         return spline_value(X, self.X, self.y), spline_value(X, self.X, self.z)
 
     @property
@@ -193,6 +194,6 @@ class Function(Routing):
     def __init__(self, function: Callable[..., tuple[ScalarLike, ScalarLike]], *parameters: PyTree):
         self.function = FunctionOfX("Function", function, *parameters)
 
-    def __call__(self, X: Scalar) -> tuple[Scalar, Scalar]:
+    def __call__(self, X: ScalarLike) -> tuple[Scalar, Scalar]:
         y, z = self.function(X)
-        return jnp.asarray(y, X.dtype), jnp.asarray(z, X.dtype)
+        return y, z

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 from ..numerics.component import Forces, Tree, Vector, Wrench, add
 from ..numerics.quadrature import piece_edges
 from ..numerics.stacked import stack
-from ..typing import ArrayLike, DTypeLike, Scalar, VectorLike, cast
+from ..typing import ArrayLike, DTypeLike, Scalar, VectorLike, cast, real
 from ..validation import concrete, instance, instances, is_traced, numbers, precise
 from .actuator import Actuator
 from .description import Part, describe, described_arguments, table
@@ -220,7 +220,7 @@ class Scene(Part):
         """Ends of the smooth pieces of the arm [m], `more` breakpoints included."""
         return piece_edges(self.rod.length, (*self.breakpoints, *more))
 
-    def sections(self, X: Array) -> CrossSections:
+    def sections(self, X: ArrayLike) -> CrossSections:
         """Stiffness, rest strain and thread paths at abscissas X of any shape, in component arrays
         of that shape."""
 
@@ -232,7 +232,7 @@ class Scene(Part):
 
         return _at_each(at, X)
 
-    def thread_reach(self, X: Array) -> tuple[Array | None, ...]:
+    def thread_reach(self, X: ArrayLike) -> tuple[Array | None, ...]:
         """`CrossSections.reach` at abscissas X of any shape."""
 
         def at(x: Scalar) -> tuple[Array | None, ...]:
@@ -240,16 +240,17 @@ class Scene(Part):
 
         return _at_each(at, X)
 
-    def forces(self, inputs: Float[Array, " inputs"]) -> Forces:
+    def forces(self, inputs: VectorLike) -> Forces:
         r"""Signed thread forces $\tau$ [N] for the inputs, one scalar per thread."""
         return tuple(
-            actuator.force(value) for actuator, value in zip(self.actuators, inputs, strict=True)
+            actuator.force(value)
+            for actuator, value in zip(self.actuators, real(inputs), strict=True)
         )
 
-    def density(self, X: Array, frame: Frame) -> Wrench | None:
+    def density(self, X: ArrayLike, frame: Frame) -> Wrench | None:
         """Sum $(c, f)$ of the loads per length of a frame at abscissas X of any shape; None
         if there are none."""
-        total = None
+        X, total = real(X), None
         for load in self._fixed(frame):
             if load.point(self.rod) is not None:
                 continue
@@ -277,8 +278,9 @@ class Scene(Part):
         """Whether some load depends on the positions of the sections."""
         return any(load.needs == "pose" for load in self.pose_loads)
 
-    def admits(self, inputs: Float[Array, " inputs"]) -> Bool[Array, ""]:
+    def admits(self, inputs: VectorLike) -> Bool[Array, ""]:
         """Whether every input is finite and in its actuator's range."""
+        inputs = real(inputs)
         lowest = np.array([actuator.lowest for actuator in self.actuators], inputs.dtype)
         return jnp.all(jnp.isfinite(inputs) & (inputs >= lowest))
 
@@ -370,8 +372,9 @@ class Scene(Part):
             check_obstacles(self.rod, self.obstacles, self.edges)
 
 
-def _at_each(function: Callable[[Scalar], Tree], X: Array) -> Tree:
+def _at_each(function: Callable[[Scalar], Tree], X: ArrayLike) -> Tree:
     """Values of a function of one abscissa at abscissas X, in arrays of their shape."""
+    X = real(X)
     if X.ndim == 0:
         return function(X)
     values = jax.vmap(function)(X.reshape(-1))

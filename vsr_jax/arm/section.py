@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..numerics.component import norm
-from ..typing import Scalar, VectorLike
+from ..typing import ArrayLike, Scalar, ScalarLike, VectorLike, real
 from ..validation import choice, concrete, instance, numbers
 from .description import Part
 from .profile import Constant, Limits, Profile, ProfileLike, as_profile, pick, rising_ends, scaled
@@ -44,32 +44,32 @@ class Section(Part):
     """
 
     @abstractmethod
-    def geometry(self, X: Scalar, length: Scalar) -> Geometry:
+    def geometry(self, X: ScalarLike, length: ScalarLike) -> Geometry:
         """Area, second moments and torsion constant at X [m]."""
 
     @abstractmethod
-    def clearance(self, y: Scalar, z: Scalar, X: Scalar, length: Scalar) -> Scalar:
+    def clearance(self, y: ScalarLike, z: ScalarLike, X: ScalarLike, length: ScalarLike) -> Scalar:
         """Distance [m] from (y, z) to the outer wall at X: positive inside, negative outside."""
 
     @abstractmethod
-    def outline(self, angle: Array, X: Scalar, length: Scalar) -> tuple[Array, Array]:
+    def outline(self, angle: ArrayLike, X: ScalarLike, length: ScalarLike) -> tuple[Array, Array]:
         """Points (y, z) [m] of the outer wall at X, a closed curve for `angle` [rad] from 0 (on the
         y axis) to 2 pi."""
 
     @abstractmethod
-    def outer_radius(self, X: Scalar, length: Scalar) -> Scalar:
+    def outer_radius(self, X: ScalarLike, length: ScalarLike) -> Scalar:
         """Distance [m] from the axis to the farthest point of the outer wall at X."""
 
-    def inner_radius(self, X: Scalar, length: Scalar) -> Scalar:
+    def inner_radius(self, X: ScalarLike, length: ScalarLike) -> Scalar:
         """Radius [m] of the central hole at X, 0 for a solid section."""
-        return jnp.zeros_like(X)
+        return jnp.zeros_like(real(X))
 
     @property
     @abstractmethod
     def sizes(self) -> dict[str, Profile]:
         """The size profiles by name."""
 
-    def limits(self, X: Scalar, length: Scalar) -> Limits:
+    def limits(self, X: ScalarLike, length: ScalarLike) -> Limits:
         """The sizes at X [m] and their limits."""
         sizes = {name: size(X, length) for name, size in self.sizes.items()}
         return {(name, "a size > 0"): (size, size) for name, size in sizes.items()}
@@ -118,19 +118,19 @@ class Circular(Section):
             self.radius = scaled(0.5, _size("Circular", "diameter", diameter))
         self.torsion, self.shear_correction = _options("saint_venant", shear_correction)
 
-    def geometry(self, X: Scalar, length: Scalar) -> Geometry:
+    def geometry(self, X: ScalarLike, length: ScalarLike) -> Geometry:
         r = self.radius(X, length)
         moment = math.pi / 4 * r**4
         return Geometry(math.pi * r**2, moment, moment, 2 * moment, self.shear_correction)
 
-    def clearance(self, y: Scalar, z: Scalar, X: Scalar, length: Scalar) -> Scalar:
-        return self.radius(X, length) - norm((y, z))
+    def clearance(self, y: ScalarLike, z: ScalarLike, X: ScalarLike, length: ScalarLike) -> Scalar:
+        return self.radius(X, length) - norm((real(y), real(z)))
 
-    def outline(self, angle: Array, X: Scalar, length: Scalar) -> tuple[Array, Array]:
-        r = self.radius(X, length)
+    def outline(self, angle: ArrayLike, X: ScalarLike, length: ScalarLike) -> tuple[Array, Array]:
+        r, angle = self.radius(X, length), real(angle)
         return r * jnp.cos(angle), r * jnp.sin(angle)
 
-    def outer_radius(self, X: Scalar, length: Scalar) -> Scalar:
+    def outer_radius(self, X: ScalarLike, length: ScalarLike) -> Scalar:
         return self.radius(X, length)
 
     @property
@@ -161,31 +161,31 @@ class Annular(Section):
                 )
         self.torsion, self.shear_correction = _options("saint_venant", shear_correction)
 
-    def geometry(self, X: Scalar, length: Scalar) -> Geometry:
+    def geometry(self, X: ScalarLike, length: ScalarLike) -> Geometry:
         outer, inner = self.outer(X, length), self.inner(X, length)
         moment = math.pi / 4 * (outer**4 - inner**4)
         return Geometry(
             math.pi * (outer**2 - inner**2), moment, moment, 2 * moment, self.shear_correction
         )
 
-    def clearance(self, y: Scalar, z: Scalar, X: Scalar, length: Scalar) -> Scalar:
-        return self.outer(X, length) - norm((y, z))
+    def clearance(self, y: ScalarLike, z: ScalarLike, X: ScalarLike, length: ScalarLike) -> Scalar:
+        return self.outer(X, length) - norm((real(y), real(z)))
 
-    def outline(self, angle: Array, X: Scalar, length: Scalar) -> tuple[Array, Array]:
-        r = self.outer(X, length)
+    def outline(self, angle: ArrayLike, X: ScalarLike, length: ScalarLike) -> tuple[Array, Array]:
+        r, angle = self.outer(X, length), real(angle)
         return r * jnp.cos(angle), r * jnp.sin(angle)
 
-    def outer_radius(self, X: Scalar, length: Scalar) -> Scalar:
+    def outer_radius(self, X: ScalarLike, length: ScalarLike) -> Scalar:
         return self.outer(X, length)
 
-    def inner_radius(self, X: Scalar, length: Scalar) -> Scalar:
+    def inner_radius(self, X: ScalarLike, length: ScalarLike) -> Scalar:
         return self.inner(X, length)
 
     @property
     def sizes(self) -> dict[str, Profile]:
         return {"outer": self.outer, "inner": self.inner}
 
-    def limits(self, X: Scalar, length: Scalar) -> Limits:
+    def limits(self, X: ScalarLike, length: ScalarLike) -> Limits:
         inner = self.inner(X, length)
         return {
             **super().limits(X, length),
@@ -220,25 +220,26 @@ class Rectangular(Section):
         self.height = _size("Rectangular", "height", height)
         self.torsion, self.shear_correction = _options(torsion, shear_correction)
 
-    def geometry(self, X: Scalar, length: Scalar) -> Geometry:
+    def geometry(self, X: ScalarLike, length: ScalarLike) -> Geometry:
         w, h = self.width(X, length), self.height(X, length)
         moment_y, moment_z = w * h**3 / 12, h * w**3 / 12
         torsion = moment_y + moment_z if self.torsion == "polar" else _rectangle_torsion(w, h)
         return Geometry(w * h, moment_y, moment_z, torsion, self.shear_correction)
 
-    def clearance(self, y: Scalar, z: Scalar, X: Scalar, length: Scalar) -> Scalar:
+    def clearance(self, y: ScalarLike, z: ScalarLike, X: ScalarLike, length: ScalarLike) -> Scalar:
         return jnp.minimum(
             self.width(X, length) / 2 - jnp.abs(y), self.height(X, length) / 2 - jnp.abs(z)
         )
 
-    def outline(self, angle: Array, X: Scalar, length: Scalar) -> tuple[Array, Array]:
+    def outline(self, angle: ArrayLike, X: ScalarLike, length: ScalarLike) -> tuple[Array, Array]:
+        angle = real(angle)
         cosine, sine = jnp.cos(angle), jnp.sin(angle)
         square = jnp.maximum(jnp.abs(cosine), jnp.abs(sine))
         return self.width(X, length) / 2 * cosine / square, self.height(
             X, length
         ) / 2 * sine / square
 
-    def outer_radius(self, X: Scalar, length: Scalar) -> Scalar:
+    def outer_radius(self, X: ScalarLike, length: ScalarLike) -> Scalar:
         return 0.5 * norm((self.width(X, length), self.height(X, length)))
 
     @property
@@ -281,7 +282,7 @@ class Elliptic(Section):
         self.semi_axis_z = _size("Elliptic", "semi_axis_z", semi_axis_z)
         self.torsion, self.shear_correction = _options(torsion, shear_correction)
 
-    def geometry(self, X: Scalar, length: Scalar) -> Geometry:
+    def geometry(self, X: ScalarLike, length: ScalarLike) -> Geometry:
         a, b = self.semi_axis_y(X, length), self.semi_axis_z(X, length)
         moment_y, moment_z = math.pi / 4 * a * b**3, math.pi / 4 * a**3 * b
         torsion = (
@@ -291,16 +292,15 @@ class Elliptic(Section):
         )
         return Geometry(math.pi * a * b, moment_y, moment_z, torsion, self.shear_correction)
 
-    def clearance(self, y: Scalar, z: Scalar, X: Scalar, length: Scalar) -> Scalar:
+    def clearance(self, y: ScalarLike, z: ScalarLike, X: ScalarLike, length: ScalarLike) -> Scalar:
         a, b = self.semi_axis_y(X, length), self.semi_axis_z(X, length)
-        return (1 - norm((y / a, z / b))) * jnp.minimum(a, b)
+        return (1 - norm((real(y) / a, real(z) / b))) * jnp.minimum(a, b)
 
-    def outline(self, angle: Array, X: Scalar, length: Scalar) -> tuple[Array, Array]:
-        return self.semi_axis_y(X, length) * jnp.cos(angle), self.semi_axis_z(X, length) * jnp.sin(
-            angle
-        )
+    def outline(self, angle: ArrayLike, X: ScalarLike, length: ScalarLike) -> tuple[Array, Array]:
+        a, b, angle = self.semi_axis_y(X, length), self.semi_axis_z(X, length), real(angle)
+        return a * jnp.cos(angle), b * jnp.sin(angle)
 
-    def outer_radius(self, X: Scalar, length: Scalar) -> Scalar:
+    def outer_radius(self, X: ScalarLike, length: ScalarLike) -> Scalar:
         return jnp.maximum(self.semi_axis_y(X, length), self.semi_axis_z(X, length))
 
     @property
@@ -326,19 +326,19 @@ class Joined(Section):
             for i, s in enumerate(sections)
         )
 
-    def geometry(self, X: Scalar, length: Scalar) -> Geometry:
+    def geometry(self, X: ScalarLike, length: ScalarLike) -> Geometry:
         return pick(X, self.ends, [section.geometry(X, length) for section in self.sections])
 
-    def clearance(self, y: Scalar, z: Scalar, X: Scalar, length: Scalar) -> Scalar:
+    def clearance(self, y: ScalarLike, z: ScalarLike, X: ScalarLike, length: ScalarLike) -> Scalar:
         return pick(X, self.ends, [section.clearance(y, z, X, length) for section in self.sections])
 
-    def outline(self, angle: Array, X: Scalar, length: Scalar) -> tuple[Array, Array]:
+    def outline(self, angle: ArrayLike, X: ScalarLike, length: ScalarLike) -> tuple[Array, Array]:
         return pick(X, self.ends, [section.outline(angle, X, length) for section in self.sections])
 
-    def outer_radius(self, X: Scalar, length: Scalar) -> Scalar:
+    def outer_radius(self, X: ScalarLike, length: ScalarLike) -> Scalar:
         return pick(X, self.ends, [section.outer_radius(X, length) for section in self.sections])
 
-    def inner_radius(self, X: Scalar, length: Scalar) -> Scalar:
+    def inner_radius(self, X: ScalarLike, length: ScalarLike) -> Scalar:
         return pick(X, self.ends, [section.inner_radius(X, length) for section in self.sections])
 
     @property
@@ -349,7 +349,7 @@ class Joined(Section):
             for name, size in section.sizes.items()
         }
 
-    def limits(self, X: Scalar, length: Scalar) -> Limits:
+    def limits(self, X: ScalarLike, length: ScalarLike) -> Limits:
         here, found = pick(X, self.ends, list(range(len(self.sections)))), {}
         for i, section in enumerate(self.sections):
             for (name, needed), (value, room) in section.limits(X, length).items():

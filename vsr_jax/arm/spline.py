@@ -5,7 +5,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from ..typing import Scalar, VectorLike
+from ..typing import Scalar, ScalarLike, VectorLike
 from ..validation import concrete, numbers
 
 Points = Float[Array, " points"]
@@ -29,7 +29,7 @@ def spline_breakpoints(points: Points) -> tuple[Scalar, ...]:
     return tuple(points[i] for i in range(2, points.size - 2))
 
 
-def spline_value(X: Scalar, points: Points, values: Points) -> Scalar:
+def spline_value(X: ScalarLike, points: Points, values: Points) -> Scalar:
     """Value at X [m] of the spline through `values` at the abscissas `points` [m].
 
     Two points give the straight line and three the parabola through them. The first and the last

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..numerics.component import norm, split
 from ..numerics.quadrature import ascending
-from ..typing import MatrixLike, Pose, Scalar, ScalarLike
+from ..typing import MatrixLike, Pose, Scalar, ScalarLike, VectorLike, real
 from ..validation import concrete, numbers, rigid
 from .functions import Position
 from .obstacles import Obstacle, coefficient, local_point
@@ -69,7 +69,7 @@ class Tube(Obstacle):
                 f"Tube.radius: got {radius!r} and no line, need a number for a tube without a line"
             )
 
-    def distance(self, point: Position) -> Scalar:
+    def distance(self, point: VectorLike) -> Scalar:
         local = local_point(self.pose, point)
         if self.line is None:
             zero = jnp.zeros_like(local[0])
@@ -108,8 +108,9 @@ class Tube(Obstacle):
         return jnp.min(self.radii)
 
     def directions(
-        self, point: Position, heading: Position, lengths: Float[Array, " steps"]
+        self, point: VectorLike, heading: VectorLike, lengths: VectorLike
     ) -> Float[Array, "steps 3"] | None:
+        heading, lengths = real(heading), real(lengths)
         turn = jnp.eye(3, dtype=lengths.dtype) if self.pose is None else self.pose[:3, :3]
         if self.line is None:
             along = jnp.sign(turn[:, 0] @ heading) * turn[:, 0]

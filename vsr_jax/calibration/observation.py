@@ -25,7 +25,7 @@ from jaxtyping import Array, Float
 from ..arm.rod import Rod
 from ..numerics.se3 import rotation_vector
 from ..solution.equilibrium import Equilibrium
-from ..typing import ArrayLike, MatrixLike, ScalarLike
+from ..typing import ArrayLike, MatrixLike, ScalarLike, real
 from ..validation import instance, numbers, on_arm, rigid
 
 
@@ -47,9 +47,9 @@ class Observation(eqx.Module):
     def predicted(self, eq: Equilibrium) -> Array:
         """What the model predicts for one shape, by default of shape (rows, components)."""
 
-    def residual(self, eq: Equilibrium, value: Array) -> Float[Array, "rows components"]:
+    def residual(self, eq: Equilibrium, value: ArrayLike) -> Float[Array, "rows components"]:
         """Predicted minus measured value of one shape; NaN where nothing was measured."""
-        return self.predicted(eq) - value
+        return self.predicted(eq) - real(value)
 
     @property
     def present(self) -> np.ndarray:
@@ -251,8 +251,8 @@ class Poses(Observation):
     def predicted(self, eq: Equilibrium) -> Float[Array, "points 4 4"]:
         return eq.tip[None] if self.X is None else eq.pose(self.X)
 
-    def residual(self, eq: Equilibrium, value: Array) -> Float[Array, "rows 3"]:
-        g = self.predicted(eq)
+    def residual(self, eq: Equilibrium, value: ArrayLike) -> Float[Array, "rows 3"]:
+        g, value = self.predicted(eq), real(value)
         seen = jnp.all(jnp.isfinite(value), axis=(1, 2), keepdims=True)
         measured = jnp.where(seen, value, jnp.eye(4, dtype=g.dtype))
         turn = jnp.swapaxes(measured[:, :3, :3], 1, 2) @ g[:, :3, :3]

@@ -41,7 +41,7 @@ from ..numerics.stacked import (
     transpose,
     turned,
 )
-from ..typing import Scalar
+from ..typing import MatrixLike, Scalar, ScalarLike, VectorLike, real
 from .border import Border
 from .coupling import SOFTENED, ArmProblem, ArmState, Coupling
 from .loading import Loading
@@ -245,8 +245,10 @@ class HoldingMoment(PoseLoad):
     def needs(self) -> Needs:
         return "rotation"
 
-    def potential(self, rod: Rod, X: Scalar, rotation: Array, position: Array) -> Scalar:
-        off = rotation_vector(matmul(rotation, transpose(self.orientation)))
+    def potential(
+        self, rod: Rod, X: ScalarLike, rotation: MatrixLike, position: VectorLike
+    ) -> Scalar:
+        off = rotation_vector(matmul(real(rotation), transpose(self.orientation)))
         return -dot(self.moment, off)
 
 
@@ -272,13 +274,15 @@ class HoldingSpring(PoseLoad):
         self.directions, self.position, self.orientation = directions, position, orientation
         self.push, self.turn, self.frame = push, turn, "world"
 
-    def potential(self, rod: Rod, X: Scalar, rotation: Array, position: Array) -> Scalar:
+    def potential(
+        self, rod: Rod, X: ScalarLike, rotation: MatrixLike, position: VectorLike
+    ) -> Scalar:
         energy = jnp.zeros_like(self.push)
         if self.directions is not None and self.position is not None:
-            apart = matvec(transpose(self.directions), position - self.position)
+            apart = matvec(transpose(self.directions), real(position) - self.position)
             energy += 0.5 * self.push * dot(apart, apart)
         if self.orientation is not None:
-            off = rotation_vector(matmul(rotation, transpose(self.orientation)))
+            off = rotation_vector(matmul(real(rotation), transpose(self.orientation)))
             energy += 0.5 * self.turn * dot(off, off)
         return energy
 

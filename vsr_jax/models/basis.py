@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from ..arm.profile import FunctionOfX
 from ..arm.rod import STRAINS
 from ..arm.scene import Scene
-from ..typing import Scalar, VectorLike
+from ..typing import Scalar, ScalarLike, VectorLike, real
 from ..validation import concrete, count, instance, numbers
 
 
@@ -34,10 +34,10 @@ class Family(eqx.Module):
         """Number of functions."""
 
     @abstractmethod
-    def __call__(self, X: Scalar, length: Scalar) -> Float[Array, " size"]:
+    def __call__(self, X: ScalarLike, length: ScalarLike) -> Float[Array, " size"]:
         """Their values at X [m] on an arm of `length` [m]."""
 
-    def breakpoints(self, length: Scalar) -> tuple[Scalar, ...]:
+    def breakpoints(self, length: ScalarLike) -> tuple[Scalar, ...]:
         """Abscissas [m] where a function or its derivative jumps."""
         return ()
 
@@ -54,8 +54,8 @@ class Monomial(Family):
     def size(self) -> int:
         return self.order + 1
 
-    def __call__(self, X: Scalar, length: Scalar) -> Float[Array, " size"]:
-        s = X / length
+    def __call__(self, X: ScalarLike, length: ScalarLike) -> Float[Array, " size"]:
+        s = real(X) / length
         values = [jnp.ones_like(s)]
         for _ in range(self.order):
             values.append(values[-1] * s)
@@ -75,8 +75,8 @@ class Legendre(Family):
     def size(self) -> int:
         return self.order + 1
 
-    def __call__(self, X: Scalar, length: Scalar) -> Float[Array, " size"]:
-        x = 2 * X / length - 1
+    def __call__(self, X: ScalarLike, length: ScalarLike) -> Float[Array, " size"]:
+        x = 2 * real(X) / length - 1
         values = [jnp.ones_like(x), x]
         for i in range(1, self.order):
             values.append(((2 * i + 1) * x * values[i] - i * values[i - 1]) / (i + 1))
@@ -122,7 +122,7 @@ class Trigonometric(Family):
     def size(self) -> int:
         return int(self.constant) + self.frequencies.size * (int(self.sine) + int(self.cosine))
 
-    def __call__(self, X: Scalar, length: Scalar) -> Float[Array, " size"]:
+    def __call__(self, X: ScalarLike, length: ScalarLike) -> Float[Array, " size"]:
         phase = self.frequencies * X
         groups = [jnp.ones_like(phase[:1])] if self.constant else []
         groups += [jnp.sin(phase)] if self.sine else []
@@ -157,11 +157,11 @@ class PiecewiseConstant(Family):
     def size(self) -> int:
         return self.ends.size + 1
 
-    def __call__(self, X: Scalar, length: Scalar) -> Float[Array, " size"]:
+    def __call__(self, X: ScalarLike, length: ScalarLike) -> Float[Array, " size"]:
         section = jnp.searchsorted(self.ends * length, X, side="right")
         return (jnp.arange(self.size) == section).astype(self.ends.dtype)
 
-    def breakpoints(self, length: Scalar) -> tuple[Scalar, ...]:
+    def breakpoints(self, length: ScalarLike) -> tuple[Scalar, ...]:
         return tuple(end * length for end in self.ends)
 
 
@@ -180,8 +180,8 @@ class Functions(Family):
     def size(self) -> int:
         return self._size
 
-    def __call__(self, X: Scalar, length: Scalar) -> Float[Array, " size"]:
-        return _of_shape("Functions", self.function(X), (self.size,), X)
+    def __call__(self, X: ScalarLike, length: ScalarLike) -> Float[Array, " size"]:
+        return _of_shape("Functions", self.function(X), (self.size,))
 
 
 class AbstractBasis(eqx.Module):
@@ -193,7 +193,7 @@ class AbstractBasis(eqx.Module):
         """Number of degrees of freedom n."""
 
     @abstractmethod
-    def matrix(self, X: Scalar, length: Scalar) -> Float[Array, "6 dofs"]:
+    def matrix(self, X: ScalarLike, length: ScalarLike) -> Float[Array, "6 dofs"]:
         """$B_q(X)$, shape (6, n)."""
 
     @property
@@ -206,7 +206,7 @@ class AbstractBasis(eqx.Module):
         """Name and unit of each coordinate."""
         return unnamed(self.size)
 
-    def breakpoints(self, length: Scalar) -> tuple[Scalar, ...]:
+    def breakpoints(self, length: ScalarLike) -> tuple[Scalar, ...]:
         """Abscissas [m] where the basis or its derivative jumps."""
         return ()
 
@@ -278,7 +278,7 @@ class Basis(AbstractBasis):
     def size(self) -> int:
         return sum(family.size for family in self.families.values())
 
-    def matrix(self, X: Scalar, length: Scalar) -> Float[Array, "6 dofs"]:
+    def matrix(self, X: ScalarLike, length: ScalarLike) -> Float[Array, "6 dofs"]:
         blocks = []
         for row, name in enumerate(STRAINS):
             if name in self.families:
@@ -286,7 +286,7 @@ class Basis(AbstractBasis):
                 blocks.append(jnp.zeros((6, values.size), values.dtype).at[row].set(values))
         return jnp.concatenate(blocks, axis=1)
 
-    def breakpoints(self, length: Scalar) -> tuple[Scalar, ...]:
+    def breakpoints(self, length: ScalarLike) -> tuple[Scalar, ...]:
         distinct = (self.families[name] for name in self._distinct)
         return tuple(x for family in distinct for x in family.breakpoints(length))
 
@@ -305,12 +305,12 @@ class FunctionBasis(AbstractBasis):
     def size(self) -> int:
         return self._size
 
-    def matrix(self, X: Scalar, length: Scalar) -> Float[Array, "6 dofs"]:
-        return _of_shape("FunctionBasis", self.function(X), (6, self.size), X)
+    def matrix(self, X: ScalarLike, length: ScalarLike) -> Float[Array, "6 dofs"]:
+        return _of_shape("FunctionBasis", self.function(X), (6, self.size))
 
 
-def _of_shape(owner: str, value: Any, shape: tuple[int, ...], X: Scalar) -> Array:
-    array = jnp.asarray(value, X.dtype)
+def _of_shape(owner: str, value: Any, shape: tuple[int, ...]) -> Array:
+    array = jnp.asarray(value)
     if array.shape != shape:
         raise ValueError(f"{owner}.function: got values of shape {array.shape}, need {shape}")
     return array

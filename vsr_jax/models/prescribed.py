@@ -28,7 +28,7 @@ from ..numerics.implicit import implicit_root
 from ..numerics.magnus import ORDERS, accumulate_jacobian
 from ..numerics.newton import Evaluation, Root, newton
 from ..numerics.quadrature import make_grid, onto
-from ..typing import Scalar, ScalarLike
+from ..typing import Scalar, ScalarLike, VectorLike, real
 from ..validation import ROUNDING, choice, count, instance, on_arm
 from . import prescribed_loaded
 from .base import Nodes, Outcome, Status, SteppedModel, classify
@@ -250,7 +250,7 @@ def stiffness_matrix(
 
 
 def actuation_matrix(
-    scene: Scene, basis: AbstractBasis, q: Float[Array, " dofs"], *, points: int = 32
+    scene: Scene, basis: AbstractBasis, q: VectorLike, *, points: int = 32
 ) -> Float[Array, "dofs threads"]:
     r"""Generalised actuation matrix (eq. 18): $B(q) = \int_0^L B_q^T B_\tau(q) \, dX$, the
     transpose of $\partial l / \partial q$.
@@ -261,7 +261,7 @@ def actuation_matrix(
 
     **Returns:** shape (n, threads).
     """
-    projection = project(scene, basis, points)
+    q, projection = real(q), project(scene, basis, points)
     xi = projection.strain(q)
     ones = tuple(jnp.ones((), q.dtype) for _ in scene.actuators)
     sections = projection.sections
@@ -276,7 +276,7 @@ def actuation_matrix(
 def jacobian(
     scene: Scene,
     basis: AbstractBasis,
-    q: Float[Array, " dofs"],
+    q: VectorLike,
     X: ScalarLike | None = None,
     *,
     steps: int = 32,
@@ -306,7 +306,7 @@ def jacobian(
     grid = make_grid(edges, steps, choice("order", order, ORDERS) // 2)
     nodes = grid.X.T.reshape(-1)
     matrix = jax.vmap(lambda x: basis_at(scene, basis, x))(nodes)
-    xi = matrix @ q + c.join(scene.sections(nodes).rest)
+    xi = matrix @ real(q) + c.join(scene.sections(nodes).rest)
     shape = grid.X.T.shape
     J = accumulate_jacobian(xi.reshape(*shape, 6), matrix.reshape(*shape, 6, -1), grid.h)
     return jnp.where(near, J, jnp.nan)

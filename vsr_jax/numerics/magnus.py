@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from ..typing import Pose, Scalar, Twist
+from ..typing import MatrixLike, Pose, Scalar, ScalarLike, Twist, VectorLike, real
 from ..validation import choice
 from .component import Vector
 from .once import once
@@ -56,7 +56,7 @@ def magnus_6(a1: Array, a2: Array, a3: Array, bracket: Callable[[Array, Array], 
     return a1 + 1 / 12 * a3 + 1 / 240 * inner
 
 
-def step_twist(strains: Float[Array, "stages 6"], h: Scalar) -> Twist:
+def step_twist(strains: MatrixLike, h: ScalarLike) -> Twist:
     r"""Magnus increment of one step, of order 2, 4 or 6 with one, two or three Gauss points.
 
     Order 2: $\Omega = h \xi_1$. Order 4: eq. (5), see `zanna_step`. Order 6, with $\alpha_1 = h
@@ -76,11 +76,12 @@ def step_twist(strains: Float[Array, "stages 6"], h: Scalar) -> Twist:
     **Source:** Blanes, Casas, Oteo and Ros, The Magnus expansion, Physics Reports 470 (2009), eq.
     (254) ff., with the brackets reversed for $g' = g \hat\xi$.
     """
+    strains = real(strains)
     choice("strains.shape[0]", strains.shape[0], (1, 2, 3))
-    return stacked_twist(strains.T, h)
+    return stacked_twist(strains.T, real(h))
 
 
-def zanna_step(xi_1: Twist, xi_2: Twist, h: Scalar) -> Twist:
+def zanna_step(xi_1: VectorLike, xi_2: VectorLike, h: ScalarLike) -> Twist:
     r"""Fourth-order Magnus increment of one step (eq. 5).
 
     $\Omega = \frac h2 (\xi_1 + \xi_2) + \frac{\sqrt 3 h^2}{12} [\xi_1, \xi_2]$
@@ -95,7 +96,7 @@ def zanna_step(xi_1: Twist, xi_2: Twist, h: Scalar) -> Twist:
 
     **Source:** eq. (5) of Renda et al. 2020; A. Zanna, SIAM J. Numer. Anal. 36 (1999).
     """
-    return step_twist(jnp.stack([xi_1, xi_2]), h)
+    return step_twist(jnp.stack([real(xi_1), real(xi_2)]), h)
 
 
 def _advanced(

@@ -16,9 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..typing import Pose, Twist
+from ..typing import ArrayLike, MatrixLike, Pose, Twist, VectorLike, real
 from . import stacked
-from .component import Matrix, Vector
 from .once import once
 from .stacked import columns, cross, product, rows
 
@@ -110,9 +109,9 @@ def stacked_product(g: Array, increment: Array) -> Array:
     return further + jnp.pad(columns(g, 3, 4), [(0, 0), (3, 0), *[(0, 0)] * (g.ndim - 2)])
 
 
-def skew(v: Float[Array, "3"]) -> Float[Array, "3 3"]:
+def skew(v: VectorLike) -> Float[Array, "3 3"]:
     r"""Matrix $\tilde v$ with $\tilde v w = v \times w$."""
-    return stacked.skew(v)
+    return stacked.skew(real(v))
 
 
 def unskew(matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch 3"]:
@@ -123,7 +122,7 @@ def unskew(matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch 3"]:
     return 0.5 * jnp.stack(parts, axis=-1)
 
 
-def hat(xi: Twist) -> Pose:
+def hat(xi: VectorLike) -> Pose:
     r"""Matrix of a twist (eq. 2).
 
     $\hat\xi = \begin{pmatrix} \tilde k & u \\ 0 & 0 \end{pmatrix}$, so that a pose obeys $g' = g
@@ -133,24 +132,26 @@ def hat(xi: Twist) -> Pose:
 
     **Returns:** the matrix $\hat\xi$, shape (4, 4).
     """
+    xi = real(xi)
     top = jnp.concatenate([skew(xi[:3]), xi[3:, None]], axis=1)
     return jnp.concatenate([top, jnp.zeros_like(top[:1])])
 
 
-def vee(matrix: Pose) -> Twist:
+def vee(matrix: MatrixLike) -> Twist:
     r"""Twist of a matrix of se(3), the inverse of `hat`: the skew part of $\tilde k$ is taken.
 
     **Arguments:** `matrix`: $\hat\xi$, shape (4, 4).
 
     **Returns:** $\xi = (k, u)$, shape (6,).
     """
+    matrix = real(matrix)
     return jnp.concatenate([unskew(matrix), matrix[:3, 3]])
 
 
-def pose(rotation: Array | Matrix, position: Array | Vector) -> Float[Array, "*batch 4 4"]:
+def pose(rotation: ArrayLike, position: ArrayLike) -> Float[Array, "*batch 4 4"]:
     """Matrix $g$ of shape (..., 4, 4) from the components of $R$, shape (3, 3, ...), and of $r$,
     shape (3, ...), arrays or tuples of arrays."""
-    R, r = jnp.asarray(rotation), jnp.asarray(position)
+    R, r = real(rotation), real(position)
     return whole_pose(jnp.concatenate([R, r[:, None]], axis=1))
 
 
@@ -161,9 +162,10 @@ def whole_pose(g: Array) -> Float[Array, "*batch 4 4"]:
     return jnp.concatenate([upper, last], axis=-2)
 
 
-def nearest_pose(g: Pose) -> Pose:
+def nearest_pose(g: MatrixLike) -> Pose:
     r"""The pose with the rotation nearest to a matrix R that is nearly one, as with six digits, by
     two steps $R \gets \tfrac12 R (3 - R^T R)$ (Higham, Functions of Matrices, 2008, chapter 8)."""
+    g = real(g)
     R = g[:3, :3]
     for _ in range(2):
         R = 1.5 * R - 0.5 * product(R, product(R.swapaxes(0, 1), R))
@@ -175,7 +177,7 @@ def base_pose(base: Array | None, dtype: Any) -> Array | np.ndarray:
     return np.eye(4, dtype=dtype) if base is None else base
 
 
-def exp(omega: Twist) -> Pose:
+def exp(omega: VectorLike) -> Pose:
     r"""Exponential map (eq. 24).
 
     $\exp\hat\Omega = I + \hat\Omega + \frac{1-\cos\theta}{\theta^2}\hat\Omega^2 +
@@ -185,23 +187,25 @@ def exp(omega: Twist) -> Pose:
 
     **Returns:** the pose, shape (4, 4). Derivatives are exact at $\theta = 0$ too.
     """
-    return whole_pose(stacked_exp(omega))
+    return whole_pose(stacked_exp(real(omega)))
 
 
-def inverse(g: Pose) -> Pose:
+def inverse(g: MatrixLike) -> Pose:
     r"""Inverse pose $g^{-1} = (R^T, -R^T r)$, shape (4, 4)."""
+    g = real(g)
     rotation = g[:3, :3].T
     top = jnp.concatenate([rotation, -(rotation @ g[:3, 3])[:, None]], axis=1)
     return jnp.concatenate([top, g[3:]])
 
 
-def rotation_vector(rotation: Float[Array, "3 3"]) -> Float[Array, "3"]:
+def rotation_vector(rotation: MatrixLike) -> Float[Array, "3"]:
     r"""Axis times angle [rad] of a rotation, $\theta$ with $R = \exp \tilde\theta$, $|\theta| \le
     \pi$.
 
     Smooth except at half a turn, where both signs are right. The axis is that of the skew part,
     $\sin\theta\, n$, and for large angles that of the symmetric part, $(1 - \cos\theta)\, n n^T$.
     """
+    rotation = real(rotation)
     axis = unskew(rotation)
     cosine = 0.5 * (jnp.trace(rotation) - 1)
     square = jnp.dot(axis, axis)
@@ -222,41 +226,45 @@ def _blocks(a: Array, b: Array, c_: Array, d: Array) -> Float[Array, "6 6"]:
     return jnp.concatenate([jnp.concatenate([a, b], axis=1), jnp.concatenate([c_, d], axis=1)])
 
 
-def adjoint(g: Pose) -> Float[Array, "6 6"]:
+def adjoint(g: MatrixLike) -> Float[Array, "6 6"]:
     r"""Adjoint map of a pose; it maps twists from the body frame to the world frame.
 
     $\mathrm{Ad}_g = \begin{pmatrix} R & 0 \\ \tilde r R & R \end{pmatrix}$, shape (6, 6).
     """
+    g = real(g)
     rotation = g[:3, :3]
     return _blocks(rotation, jnp.zeros_like(rotation), skew(g[:3, 3]) @ rotation, rotation)
 
 
-def coadjoint(g: Pose) -> Float[Array, "6 6"]:
+def coadjoint(g: MatrixLike) -> Float[Array, "6 6"]:
     r"""Co-adjoint map of a pose; it maps wrenches from the body frame to the world frame.
 
     $\mathrm{Ad}^*_g = \begin{pmatrix} R & \tilde r R \\ 0 & R \end{pmatrix} =
     \mathrm{Ad}_{g^{-1}}^T$, shape (6, 6).
     """
+    g = real(g)
     rotation = g[:3, :3]
     return _blocks(rotation, skew(g[:3, 3]) @ rotation, jnp.zeros_like(rotation), rotation)
 
 
-def ad(xi: Twist) -> Float[Array, "6 6"]:
+def ad(xi: VectorLike) -> Float[Array, "6 6"]:
     r"""Adjoint map of a twist, the Lie bracket $\mathrm{ad}_\xi \eta = [\xi, \eta]$.
 
     $\mathrm{ad}_\xi = \begin{pmatrix} \tilde k & 0 \\ \tilde u & \tilde k \end{pmatrix}$, shape (6,
     6).
     """
+    xi = real(xi)
     k, u = skew(xi[:3]), skew(xi[3:])
     return _blocks(k, jnp.zeros_like(k), u, k)
 
 
-def coad(xi: Twist) -> Float[Array, "6 6"]:
+def coad(xi: VectorLike) -> Float[Array, "6 6"]:
     r"""Co-adjoint map of a twist, so that $(\mathrm{Ad}^*_g)' = \mathrm{Ad}^*_g \mathrm{ad}^*_\xi$
     along an arm.
 
     $\mathrm{ad}^*_\xi = \begin{pmatrix} \tilde k & \tilde u \\ 0 & \tilde k \end{pmatrix} =
     -\mathrm{ad}_\xi^T$, shape (6, 6).
     """
+    xi = real(xi)
     k, u = skew(xi[:3]), skew(xi[3:])
     return _blocks(k, u, jnp.zeros_like(k), k)

@@ -200,11 +200,13 @@ class View:
         self._pending.update(values)
         return self._worker.post("move", lambda: self._answer_moves(slid=False))
 
-    def drag(self, target: np.ndarray) -> threading.Event:
+    def drag(self, target: VectorLike) -> threading.Event:
         """Drags the tip to a position [m], as a user does; the event is set when the answer is
         drawn."""
         self._player.pause()
-        return self._worker.post("drag", lambda: self.show(self.session.drag(target), dragged=True))
+        return self._worker.post(
+            "drag", lambda: self.show(self.session.drag(np.asarray(target)), dragged=True)
+        )
 
     def _first(self) -> None:
         self.show(self.session.solve())
