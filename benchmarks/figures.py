@@ -23,6 +23,7 @@ from benchmarks.designs import arm as wire, s_curve
 from vsr_jax import annotate, plot, plot_design
 from vsr_jax.arm.placement import Direction
 from vsr_jax.optimization.descent import History
+from vsr_jax.optimization.problem import Terms
 from vsr_jax.viz.space import equal_scale, fill, world_frame
 from vsr_jax.viz.style import ink, mixed
 
@@ -100,10 +101,10 @@ def design() -> Any:
     file = vsr.load(FOLDER / "benchmarks/results/designed_s.toml")
     none = History(np.zeros((0, 1)), np.zeros((0, 1)))
     inputs = jnp.asarray(file.inputs)[None]
-    found = vsr.Design(file.scene, inputs, 0.0, True, {}, (), (), 0, none)
-    return plot_design.before_after(
-        wire(0.004), found, [[5.0]], model=MODEL, targets=s_curve(20)
-    ).figure
+    asked = vsr.objective.CurveError(s_curve(20))
+    problem = Terms(wire(0.004), jnp.array([[5.0]]), MODEL, asked, (), {})
+    found = vsr.Design(file.scene, inputs, 0.0, True, {}, (), (), 0, none, problem)
+    return plot_design.before_after(found).figure
 
 
 def frame() -> Any:

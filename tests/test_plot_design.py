@@ -18,6 +18,7 @@ from vsr_jax.cli import design_commands as cli_design, main as cli
 from vsr_jax.files.scene_file import load
 from vsr_jax.optimization.descent import History
 from vsr_jax.optimization.design_file import load_design
+from vsr_jax.optimization.problem import Terms
 from vsr_jax.viz import annotate, plot, plot_design
 from vsr_jax.viz.animation import film
 
@@ -204,18 +205,20 @@ def test_a_film_as_mp4(eq, tmp_path):
 def test_a_design_is_drawn_for_every_set_of_inputs_with_its_targets(eq):
     scene = vsr.Scene(eq.scene.rod, eq.scene.actuators)
     none = History(np.zeros((0, 1)), np.zeros((0, 1)))
-    found = vsr.Design(scene, jnp.array([[1.0], [2.0]]), 0.0, True, {}, (), (), 0, none)
     targets = np.array([[0.28, 0.03, 0.0], [0.26, 0.07, 0.0]])
     objective = 0.5 * vsr.objective.TipError(targets) + vsr.objective.Tension(5.0)
-    for given in (targets, objective):
-        ax = plot_design.before_after(scene, found, [[0.5], [1.5]], model=MODEL, targets=given)
+    problem = Terms(scene, jnp.array([[0.5], [1.5]]), MODEL, objective, (), {})
+    inputs = jnp.array([[1.0], [2.0]])
+    found = vsr.Design(scene, inputs, 0.0, True, {}, (), (), 0, none, problem)
+    for given, drawn in ((None, targets), (targets[:1], targets[:1])):
+        ax = plot_design.before_after(found, targets=given)
         names = [text.get_text() for text in ax.get_legend().get_texts()]
         assert names == ["before", "after", "target"]
         ends = [np.array(line.get_data_3d())[:, -1] for line in ax.lines[1::2]]
         tips = [vsr.solve(scene, [u], model=MODEL).tip[:3, 3] for u in (0.5, 1.5, 1.0, 2.0)]
         np.testing.assert_allclose(ends, tips, atol=1e-9)
         crosses = np.transpose(ax.collections[-1]._offsets3d)
-        np.testing.assert_allclose(crosses, targets)
+        np.testing.assert_allclose(crosses, drawn)
 
 
 @pytest.mark.slow
@@ -255,11 +258,12 @@ def test_a_history_marks_the_best_start(problem):
 
 def test_a_design_of_a_scene_without_equilibrium_is_drawn_alone(eq):
     none = History(np.zeros((0, 1)), np.zeros((0, 1)))
-    found = vsr.Design(eq.scene, eq.inputs[None], 0.0, True, {}, (), (), 0, none)
-    space = plot_design.before_after(eq.scene, found, jnp.array([1e6]), model=MODEL)
-    assert [text.get_text() for text in space.get_legend().get_texts()] == ["after"]
-    space = plot_design.before_after(eq.scene, found, jnp.array([2.0]), model=MODEL)
-    assert [text.get_text() for text in space.get_legend().get_texts()] == ["before", "after"]
+    for tension, names in ((1e6, ["after"]), (2.0, ["before", "after"])):
+        objective = vsr.objective.Tension(5.0)
+        problem = Terms(eq.scene, jnp.array([[tension]]), MODEL, objective, (), {})
+        found = vsr.Design(eq.scene, eq.inputs[None], 0.0, True, {}, (), (), 0, none, problem)
+        space = plot_design.before_after(found)
+        assert [text.get_text() for text in space.get_legend().get_texts()] == names
 
 
 @pytest.mark.parametrize(

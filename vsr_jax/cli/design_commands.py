@@ -105,11 +105,11 @@ def _design(options: argparse.Namespace) -> int:
             },
         )
     if options.plot:
-        _draw(problem, found, inputs, options.plot)
+        _draw(found, options.plot)
     return DONE if found.feasible else NOT_CONVERGED
 
 
-def _draw(problem: Any, found: Any, inputs: np.ndarray, path: str) -> None:
+def _draw(found: Any, path: str) -> None:
     draw_without_display()
     import matplotlib.pyplot as plt
 
@@ -119,6 +119,6 @@ def _draw(problem: Any, found: Any, inputs: np.ndarray, path: str) -> None:
         figure = plt.figure(figsize=(10, 4.5))
         space = figure.add_subplot(projection="3d")
         space.set_position((0.0, 0.02, 0.52, 0.92))
-        plot_design.before_after(problem.scene, found, inputs, space, targets=problem.objective)
+        plot_design.before_after(found, space)
         plot_design.history(found, figure.add_axes((0.66, 0.14, 0.32, 0.8)))
         figure.savefig(path, dpi=150)

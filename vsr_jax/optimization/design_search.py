@@ -65,6 +65,8 @@ class Design(NamedTuple):
     - `free`: names of the free numbers.
     - `starts`: the best of each start, in order, and `best`, the index of the best of them.
     - `history`: objective, violation and free numbers of each start at each step.
+    - `problem`: what was asked: the initial `scene` and `inputs`, the `model`, the `objective` and
+      the `constraints`.
     """
 
     scene: Scene
@@ -76,6 +78,7 @@ class Design(NamedTuple):
     starts: tuple[Start, ...]
     best: int
     history: History
+    problem: Terms
 
     @property
     def numbers(self) -> dict[str, Array]:
@@ -248,4 +251,5 @@ def _result(problem: DesignProblem, terms: Terms, states: DescentState, history:
         starts,
         best,
         history,
+        terms,
     )

@@ -8,8 +8,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from mpl_toolkits.mplot3d import Axes3D
 
-from ..arm.scene import Scene
-from ..models.base import Model
 from ..optimization.design_search import Design
 from ..optimization.objective import CurveError, Objective, TipError
 from ..solution.solver import solve
@@ -47,27 +45,22 @@ def history(design: Design, ax: Axes | None = None) -> Axes:
 
 
 def before_after(
-    scene: Scene,
-    design: Design,
-    inputs: ArrayLike,
-    ax: Axes3D | None = None,
-    *,
-    model: Model | None = None,
-    targets: ArrayLike | Objective | None = None,
+    design: Design, ax: Axes3D | None = None, *, targets: ArrayLike | None = None
 ) -> Axes3D:
     """The arms of the initial scene that have an equilibrium (dashed) and the arms of the design,
     one for each set of inputs.
 
-    **Arguments:** `scene`, `inputs`: before the design, one set of inputs or several, shape (sets,
-    actuators); `ax`: 3D axes, new ones by default; `model`: as for `solve`; `targets`: drawn as
-    crosses, positions [m], shape (..., 3), or the objective that has them.
+    **Arguments:** `ax`: 3D axes, new ones by default; `targets`: positions [m] drawn as crosses,
+    shape (..., 3), by default those of the objective.
 
     **Returns:** the axes.
     """
     own, ax = ax is None, checked_space(ax)
-    sets = np.atleast_2d(np.asarray(inputs))
-    before = [solve(scene, row, model=model) for row in sets]
-    after = [solve(design.scene, row, model=model) for row in design.inputs]
+    problem = design.problem
+    before, after = (
+        [solve(what.scene, row, model=problem.model) for row in what.inputs]
+        for what in (problem, design)
+    )
     for name, arms, color, line in (
         ("before", before, COLORS[1], "--"),
         ("after", after, COLORS[0], "-"),
@@ -79,8 +72,8 @@ def before_after(
             plot.arm(eq, ax, stations=40, **style)
     if after and bool(after[0].converged):
         annotate.obstacles(after[0], ax)
-    points = np.asarray(_targets(targets) if isinstance(targets, Objective) else targets)
-    if targets is not None and points.size:
+    points = np.asarray(_targets(problem.objective) if targets is None else targets)
+    if points.size:
         cross: dict[str, Any] = {"color": ink(), "marker": "x", "s": 28, "linewidths": 1.6}
         crosses: Any = points.reshape(-1, 3).T
         ax.scatter(*crosses, label="target", depthshade=False, **cross)
