@@ -83,12 +83,33 @@ def test_rows_of_the_inputs_are_the_jacobian(eq, table, tip_of):
     assert table["inputs[0]"].unit == "N"
 
 
-def test_the_printed_table(table):
-    text = str(table)
-    assert "actuators[2].routing.y[1]" in text
-    assert len(text.splitlines()) == 2 + len(table.names)
+def test_the_printed_table_has_the_largest_effects_first(table):
+    *rows, legend, folded = str(table).splitlines()[1:]
+    names = [row.split()[0] for row in rows]
+    effects = dict(zip(table.names, np.asarray(table.per_percent), strict=True))
+    assert names == sorted(effects, key=effects.__getitem__)[::-1][:10]
+    assert "inputs[0]" in names
+    assert float(rows[0].split()[-1]) == pytest.approx(1e3 * max(effects.values()), rel=1e-2)
+    assert legend == "dx, dy, dz: displacement of the tip [m] per unit of the number"
+    zeros = np.count_nonzero(table.values == 0)
+    counts = [int(word) for word in folded.split() if word.isdecimal()]
+    assert counts[0] + counts[-1] == len(table.names) - 10
+    assert counts[-1] == zeros
     with pytest.raises(KeyError, match="known are"):
         table["rod.lenght"]
+
+
+def test_a_table_of_all_rows_ends_with_numbers_that_are_zero():
+    names = ("small", "zero", "large")
+    place = jnp.array([[0.1, 0.0, 0.0], [0.0, 5.0, 0.0], [0.0, 0.0, -2.0]])
+    table = vsr.Sensitivity(names, ("m", "", "m"), jnp.array([1.0, 0.0, -3.0]), place, place)
+    rows = table.text(all=True).splitlines()[1:-1]
+    assert [row.split() for row in rows] == [
+        ["large", "-3", "m", "0", "0", "-2", "60"],
+        ["small", "1", "m", "0.1", "0", "0", "1"],
+        ["zero", "0", "?", "0", "5", "0", "-"],
+    ]
+    assert str(table) == table.text(all=True)
 
 
 @pytest.mark.slow

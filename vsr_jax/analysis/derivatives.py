@@ -9,6 +9,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..arm.loads import TipWrench
@@ -21,6 +22,9 @@ from ..numerics.compiling import program
 from ..numerics.se3 import skew, unskew
 from ..solution.equilibrium import Equilibrium
 from ..typing import Pose, ScalarLike, VectorLike
+
+_MOST_ROWS = 10
+"""Most rows of a printed table."""
 
 
 class SensitivityRow(NamedTuple):
@@ -35,7 +39,8 @@ class SensitivityRow(NamedTuple):
 
 class Sensitivity(eqx.Module):
     """Derivatives of the tip with respect to every number of a scene and its inputs.
-    `table["rod.length"]` is a `SensitivityRow`, `print(table)` prints all rows.
+    `table["rod.length"]` is a `SensitivityRow`. `print(table)` prints the rows with the greatest
+    effects, `print(table.text(all=True))` all rows.
 
     **Fields:** `names`, `units`; `values`, shape (numbers,); `turn` [rad] and `place` [m] per unit
     of the number, shape (numbers, 3).
@@ -53,21 +58,40 @@ class Sensitivity(eqx.Module):
             raise KeyError(f"{name!r}: known are {', '.join(self.names)}")
         return SensitivityRow(self.values[i], self.units[i], self.turn[i], self.place[i])
 
-    def __str__(self) -> str:
-        width = max(map(len, self.names))
+    @property
+    def per_percent(self) -> Float[Array, " numbers"]:
+        r"""Displacement of the tip [m] for 1 % of a number, $|p| / 100 \, |\partial r / \partial
+        p|$; zero where the number is zero, whatever its derivative."""
+        return 0.01 * jnp.abs(self.values) * c.norm(c.split(self.place))
+
+    def text(self, *, all: bool = False) -> str:
+        """The rows of the numbers with the greatest displacements per 1 %, the greatest first, and
+        how many are not shown; with `all` every row. Those of numbers that are zero have no rank
+        and come last, with "-" for the displacement."""
+        values, place = np.asarray(self.values), np.asarray(self.place)
+        effect = 1e3 * np.asarray(self.per_percent)
+        order = np.lexsort((-effect, values == 0))
+        shown, rest = (order, []) if all else (order[:_MOST_ROWS], order[_MOST_ROWS:])
+        width = max(6, *(len(self.names[i]) for i in shown))
         lines = [
             f"{'number':{width}} {'value':>12}  {'unit':7} {'dx':>10} {'dy':>10} {'dz':>10}   mm "
             f"per 1 %"
         ]
-        for name, unit, value, place in zip(
-            self.names, self.units, self.values, self.place, strict=True
-        ):
-            share = 10 * abs(float(value)) * float(jnp.linalg.norm(place))
-            steps = " ".join(f"{float(x):10.3g}" for x in place)
-            lines.append(
-                f"{name:{width}} {float(value):12.6g}  {unit or '?':7} {steps} {share:11.3g}"
-            )
-        return "\n".join([*lines, "dx, dy, dz: displacement of the tip [m] per unit of the number"])
+        for i in shown:
+            steps = " ".join(f"{x:10.3g}" for x in place[i])
+            share = f"{effect[i]:.3g}" if values[i] else "-"
+            number = f"{self.names[i]:{width}} {values[i]:12.6g}  {self.units[i] or '?':7}"
+            lines.append(f"{number} {steps} {share:>11}")
+        lines.append("dx, dy, dz: displacement of the tip [m] per unit of the number")
+        ranked = [i for i in rest if values[i]]
+        folded = [f"{len(ranked)} of at most {effect[ranked[0]]:.3g} mm per 1 %"] if ranked else []
+        if len(rest) > len(ranked):
+            folded.append(f"{len(rest) - len(ranked)} of numbers that are zero")
+        if folded:
+            lines.append(f"rows not shown: {', '.join(folded)}; print(table.text(all=True))")
+        return "\n".join(lines)
+
+    __str__ = text
 
 
 def sensitivity(eq: Equilibrium) -> Sensitivity:
