@@ -120,6 +120,12 @@ def test_methods_take_numbers_of_python(part, numbers):
             assert shapes(method, *given) == shapes(method, *arrays), name
 
 
+def test_holes_and_edges_of_plain_numbers():
+    tendon = vsr.Tendon(vsr.Parallel(0.005, 0.0), discs=2)
+    np.testing.assert_allclose(jax.jit(lambda: tendon.holes(0.215))(), [0.0, 0.1075, 0.215])
+    np.testing.assert_allclose(jax.jit(lambda: SCENE.edges([0.1]))(), [0.0, 0.1, 0.5])
+
+
 @pytest.mark.usefixtures("unchecked")
 def test_a_scene_without_actuators_takes_no_inputs():
     message = r"inputs: got shape \(1,\), need \(0,\), an empty list: the scene has no actuators;"

@@ -224,7 +224,7 @@ class FunctionProfile(Profile):
         self.function = FunctionOfX("FunctionProfile", function, *parameters)
 
     def __call__(self, X: ScalarLike, length: ScalarLike) -> Scalar:
-        return self.function(X)
+        return jnp.asarray(self.function(X))
 
 
 class _Scaled(Profile):

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 from ..numerics.component import Forces, Tree, Vector, Wrench, add
 from ..numerics.quadrature import piece_edges
 from ..numerics.stacked import stack
-from ..typing import ArrayLike, DTypeLike, Scalar, VectorLike, cast, real
+from ..typing import ArrayLike, DTypeLike, Scalar, ScalarLike, VectorLike, cast, real
 from ..validation import concrete, instance, instances, is_traced, numbers, precise
 from .actuator import Actuator
 from .description import Part, describe, described_arguments, table
@@ -216,9 +216,9 @@ class Scene(Part):
         """Most empty pieces of the arm where tendons run through the same discs."""
         return shared_discs(self.rod, self.actuators)
 
-    def edges(self, more: tuple[Scalar, ...] = ()) -> Float[Array, " edges"]:
+    def edges(self, more: Sequence[ScalarLike] = ()) -> Float[Array, " edges"]:
         """Ends of the smooth pieces of the arm [m], `more` breakpoints included."""
-        return piece_edges(self.rod.length, (*self.breakpoints, *more))
+        return piece_edges(self.rod.length, (*self.breakpoints, *map(real, more)))
 
     def sections(self, X: ArrayLike) -> CrossSections:
         """Stiffness, rest strain and thread paths at abscissas X of any shape, in component arrays
