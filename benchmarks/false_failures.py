@@ -32,7 +32,6 @@ import jax.numpy as jnp
 import numpy as np
 
 import vsr_jax as vsr
-from vsr_jax.cli.common import reduce_compile_time
 from vsr_jax.mechanics.resolution import COARSE
 
 try:
@@ -229,7 +228,8 @@ def main() -> None:
         help="also check the gradients, which takes three times as long to compile",
     )
     options = parser.parse_args()
-    reduce_compile_time(optimise=False)  # nothing is timed
+    # nothing is timed
+    os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
     jax.config.update("jax_enable_x64", True)
     record = {}
     for name in options.structures:

@@ -11,6 +11,7 @@ the solve is smooth are used; a scene with too few of them is counted as at a sw
 
 import argparse
 import json
+import os
 import time
 from collections.abc import Callable, Iterable
 from itertools import combinations
@@ -23,7 +24,6 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 import vsr_jax as vsr
-from vsr_jax.cli.common import reduce_compile_time
 
 SAME = 1e-7
 """Largest difference between two derivatives that count as the same, as a share of the
@@ -262,7 +262,8 @@ def parser(description: str | None, draws: int) -> argparse.ArgumentParser:
 
 def run(jobs: Iterable[Job], record: dict[str, Any], path: str | None) -> None:
     """Search structure by structure, with a line of the table and the record after each."""
-    reduce_compile_time(optimise=False)  # nothing is timed
+    # nothing is timed
+    os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
     jax.config.update("jax_enable_x64", True)
     print(HEADER)
     rows: list[dict[str, Any]] = []

@@ -24,6 +24,7 @@ def rows():
     return [row, row._replace(dtype="float32", strain=1e-7)]
 
 
+@pytest.mark.slow
 def test_tip_error_against_the_independent_reference(rows):
     entries = {float(entry.tau[0]): entry for entry in paper.reference("B1")}
     true = [
@@ -38,6 +39,7 @@ def test_tip_error_against_the_independent_reference(rows):
     assert rows[0].tip == pytest.approx(max(true), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_strain_is_exact_to_rounding(rows):
     assert rows[0].strain < 1e-13
 
@@ -66,6 +68,7 @@ def test_gradient_error_against_central_differences_at_ten_times_the_steps(rows)
     assert float(gradient_error(found, true, values)) == pytest.approx(rows[0].gradient, rel=0.02)
 
 
+@pytest.mark.slow
 def test_advice_and_table(rows):
     text = accuracy.advice(rows)
     assert text[0].startswith("for 1 mm use steps of order 6, 8")
@@ -74,6 +77,7 @@ def test_advice_and_table(rows):
     assert accuracy.cheapest(rows, 1e-9) is None
 
 
+@pytest.mark.slow
 def test_figure(rows):
     figure = accuracy_figures.work_precision(
         {"B1": rows}, others={"B1": {"another": ([10.0], [1e-3])}}
@@ -94,6 +98,7 @@ def test_settings_span_the_models():
     assert cli_studies._GROUPS == accuracy.GROUPS
 
 
+@pytest.mark.slow
 def test_the_command(tmp_path, capsys, monkeypatch, rows):
     def measure(scene, inputs, settings, report):
         assert inputs.shape == (2, 2)
@@ -126,6 +131,7 @@ def test_the_command(tmp_path, capsys, monkeypatch, rows):
     assert (tmp_path / "a.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_the_command_reads_a_scene_file(tmp_path, capsys, monkeypatch, rows):
     def measure(scene, inputs, settings, report):
         assert [type(actuator) for actuator in scene.actuators] == [vsr.Tendon]

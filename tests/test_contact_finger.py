@@ -65,6 +65,7 @@ def test_base_and_ball_are_in_balance(rough):
     np.testing.assert_allclose([m for _, m in at_base], moments, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_the_finger_stays_outside_the_ball(rough):
     gap = np.linalg.norm(rough[3] - CENTRE, axis=-1).min(axis=1) - BALL - RADIUS
     touches = rough[1].force.sum((1, 2)) > 1e-3
@@ -74,6 +75,7 @@ def test_the_finger_stays_outside_the_ball(rough):
     assert np.all(gap[~touches] > 1e-3)
 
 
+@pytest.mark.slow
 def test_friction_is_within_its_cone_and_the_finger_sticks_and_slips(rough):
     contacts = rough[1]
     push, rub = contacts.force[:, 0], contacts.friction[:, 0]
@@ -88,6 +90,7 @@ def test_friction_is_within_its_cone_and_the_finger_sticks_and_slips(rough):
     assert np.linalg.norm(tips[UP.size - 1] - tips[UP.size - 4]) > 1e-3
 
 
+@pytest.mark.slow
 def test_it_presses_less_while_opening(rough):
     pressed = rough[1].force.sum((1, 2))
     closing, opening = pressed[5 : UP.size - 1], pressed[UP.size : -1][::-1]
@@ -97,6 +100,7 @@ def test_it_presses_less_while_opening(rough):
     np.testing.assert_allclose(lost[0], 0.0, atol=1e-6)  # it slips back to where it first touched
 
 
+@pytest.mark.slow
 def test_without_friction_it_slips_off():
     status, contacts, _, _ = jax.tree.map(np.asarray, followed(0.0))
     pressed = contacts.force.sum((1, 2))

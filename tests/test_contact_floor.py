@@ -121,6 +121,7 @@ def test_shapes_on_a_floor_converge_with_the_number_of_steps(case):
     assert fine < min(coarse / 2.5, 8e-6)
 
 
+@pytest.mark.slow
 def test_a_low_arm_lifts_off_as_a_beam_of_small_slope():
     r"""$EI\,z'''' = -w$ with $z' = 0$ at the clamp and $z' = z'' = 0$ at the floor: the free length
     is $x = (72\,EI\,h / w)^{1/4}$, and the clamp bears $\tfrac23 w x$ and the moment

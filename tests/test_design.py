@@ -278,6 +278,7 @@ def test_an_interrupted_design_resumes_bit_identically(scene, tips, tmp_path, mo
             run(out, **other)
 
 
+@pytest.mark.slow
 def test_it_stops_at_a_given_objective(scene, tips):
     search = vsr.Search(starts=2, steps=60, candidates=2, stop_at=10.0)
     found = vsr.design(

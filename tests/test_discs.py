@@ -191,6 +191,7 @@ def test_a_tendon_is_drawn_as_chords(weighed):
     np.testing.assert_allclose(drawn[1, 1], between[0], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_reaction_is_that_to_the_loads(weighed):
     """The chords pull on both ends of an arm: the reaction at the base is the weight alone."""
     weight = 1000.0 * np.pi * RADIUS**2 * LENGTH * 9.81

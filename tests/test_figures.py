@@ -45,6 +45,7 @@ def test_a_figure_is_as_it_was_and_nothing_is_cut_off(name, tmp_path):
         np.testing.assert_array_equal(edge, 1.0)
 
 
+@pytest.mark.slow
 def test_a_missing_tendon_is_seen(tmp_path):
     with plot.theme("light"):
         complete = difference(figures.soft_arm(), "soft_arm", tmp_path)

@@ -248,6 +248,7 @@ def test_the_next_measurement_is_the_best_of_all(noisy):
     np.testing.assert_allclose(found.gain[0], max(gains), rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_bands_are_those_of_the_linear_model(noisy):
     """Position of the tip for new inputs, against differences of the fitted scene."""
     new = np.array([[0.7, 0.3]])

@@ -42,6 +42,7 @@ def test_it_is_the_sum_of_squares_and_the_prior(noisy):
         assert noisy.cost([young, gain]) == pytest.approx(wanted, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_it_is_least_at_the_fit(noisy):
     least = noisy.cost(noisy.x)
     for step in np.vstack([np.eye(2), -np.eye(2)]) * np.sqrt(np.diag(noisy.covariance)):

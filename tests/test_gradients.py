@@ -70,6 +70,7 @@ def test_modulus_batched_alone_under_friction(deflection):
     assert values[0] > values[1] > values[2] or values[0] < values[1] < values[2]
 
 
+@pytest.mark.slow
 def test_locked_strains_that_single_precision_cannot_hold():
     """A tendon at the distance d that takes in c bends an inextensible arm by c / d L; EI of that
     is T d."""

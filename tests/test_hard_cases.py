@@ -230,6 +230,7 @@ DOUBLE_OR_SLOW = pytest.mark.parametrize(
 """Single precision among the slow tests."""
 
 
+@pytest.mark.slow
 @DOUBLE_OR_SLOW
 def test_a_batch_of_all_cases_is_each_of_them(dtype):
     cases = list(TABLE.values())

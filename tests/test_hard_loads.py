@@ -182,6 +182,7 @@ def test_status_and_shape_are_what_they_must_be(name, dtype):
     np.testing.assert_allclose(tip, at(answer, case, "float64")[1][0], atol=near)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in CONVERGED if TABLE[name].coarse > 1e-11])
 def test_twice_the_steps_give_the_same_shape(name):
     case = TABLE[name]

@@ -58,6 +58,7 @@ def test_the_papers_arm_collapses_at_93_newtons():
     assert health.independence is None
 
 
+@pytest.mark.slow
 def test_twin_threads_are_not_independent(twins):
     assert abs(twins.independence) < 1e-14
     assert "some threads are redundant" in str(twins)

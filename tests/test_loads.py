@@ -123,6 +123,7 @@ def test_two_batches_of_prescribed_solves_stand_in_one_program():
     np.testing.assert_allclose(second[:512:64], first[::128], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_single_precision_holds_a_ten_thousandth_of_the_length():
     case = CASES["B1 gravity and tip force"]
     eq = vsr.solve(

@@ -14,7 +14,7 @@ import tomli_w
 from matplotlib.animation import FFMpegWriter
 
 import vsr_jax as vsr
-from vsr_jax.cli import design_commands as cli_design, main as cli
+from vsr_jax.cli import main as cli
 from vsr_jax.files.scene_file import load
 from vsr_jax.optimization.descent import History
 from vsr_jax.optimization.design_file import load_design
@@ -202,6 +202,7 @@ def test_a_film_as_mp4(eq, tmp_path):
     assert (tmp_path / "arm.mp4").read_bytes()[4:8] == b"ftyp"
 
 
+@pytest.mark.slow
 def test_a_design_is_drawn_for_every_set_of_inputs_with_its_targets(eq):
     scene = vsr.Scene(eq.scene.rod, eq.scene.actuators)
     none = History(np.zeros((0, 1)), np.zeros((0, 1)))
@@ -223,7 +224,6 @@ def test_a_design_is_drawn_for_every_set_of_inputs_with_its_targets(eq):
 
 @pytest.mark.slow
 def test_the_command_designs_saves_and_draws(problem, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(cli_design, "reduce_compile_time", lambda optimise: None)
     out, record, picture = (
         tmp_path / name for name in ("designed.toml", "design.json", "design.png")
     )
@@ -256,6 +256,7 @@ def test_a_history_marks_the_best_start(problem):
     assert np.nanmin(lines[-1].get_ydata()) == pytest.approx(found.objective)
 
 
+@pytest.mark.slow
 def test_a_design_of_a_scene_without_equilibrium_is_drawn_alone(eq):
     none = History(np.zeros((0, 1)), np.zeros((0, 1)))
     for tension, names in ((1e6, ["after"]), (2.0, ["before", "after"])):

@@ -159,6 +159,7 @@ def test_couplings_pass_through(actuators, loads, inputs):
     np.testing.assert_allclose(eq.forces, near.forces, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_batch_of_pieces_is_that_of_single_solves():
     starts = jnp.array([0.05, 0.1, 0.2])
 
@@ -172,6 +173,7 @@ def test_a_batch_of_pieces_is_that_of_single_solves():
     np.testing.assert_allclose(jax.vmap(tip)(starts), jnp.stack(each), rtol=0, atol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "loads",
     [

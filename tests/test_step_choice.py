@@ -42,6 +42,7 @@ def test_a_plan_meets_its_tolerance_between_its_samples(plans, tolerance):
     assert tolerance / 100 < worst <= tolerance  # and is not wasteful
 
 
+@pytest.mark.slow
 def test_a_millimetre_takes_single_precision_and_fewer_steps(plans):
     assert (plans[1e-3].dtype, plans[1e-6].dtype) == ("float32", "float64")
     assert plans[1e-3].model.steps <= plans[1e-6].model.steps / 2

@@ -78,6 +78,7 @@ def test_shuffled_markers_give_the_fit_of_labelled_ones(labelled, shuffled, posi
     assert wrong.chi_squared > 100 * found.chi_squared
 
 
+@pytest.mark.slow
 def test_other_measurements_are_assigned_too(labelled, shuffled):
     found = fitted(shuffled[0], labelled=False)
     markers = vsr.Markers(shuffled[0][::-1], X, offset=OFFSET, sd=SD, labelled=False)
@@ -86,6 +87,7 @@ def test_other_measurements_are_assigned_too(labelled, shuffled):
     np.testing.assert_array_equal(other.order["markers"][::-1], found.order["markers"])
 
 
+@pytest.mark.slow
 def test_half_a_position_cannot_be_assigned(positions):
     half = positions.copy()
     half[0, 0, 2] = np.nan

@@ -99,6 +99,7 @@ def test_an_answer_is_what_solve_finds(session):
 def test_moved_sliders_compile_nothing(session):
     session.solve()  # from a shape near by
     values = {x.name: session.value(x) for x in session.sliders}
+    session.move({name: value + 0.02 * abs(value) for name, value in values.items()})
     with traces() as seen:
         for name, value in values.items():
             session.move({name: value + 0.01 * abs(value)})

@@ -72,6 +72,7 @@ def test_tensions_and_turning_rates_start_too():
     agree(warm, cold)
 
 
+@pytest.mark.slow
 def test_a_hopeless_start_costs_a_step_and_nothing_else(scene):
     far = solved(scene, [20.0, 0.0])
     assert bool(far.converged)
