@@ -36,7 +36,8 @@ USED = {
     },
 }
 
-PROMISED = (
+PROMISED = {"jax", "jax.numpy", "jax.lax", "jax.typing", "jax.stages", "jax.sharding"}
+PROMISED |= {"jax.flatten_util", "jax.scipy.sparse.linalg"}
     "jax",
     "jax.numpy",
     "jax.lax",
