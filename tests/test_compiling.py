@@ -274,8 +274,11 @@ def test_a_program_is_that_of_the_arguments_and_settings():
     np.testing.assert_array_equal(scaled(x, 3, {"one": 1.0}), [6.0, 6.0])
     np.testing.assert_array_equal(scaled(x, 3, {"one": jnp.array(2.0)}), [9.0, 9.0])
     assert scaled(x.astype("float32"), 3.0, {"one": 1}).dtype == "float32"
-    with jax.enable_x64(False):
+    jax.config.update("jax_enable_x64", False)
+    try:
         assert scaled(jnp.ones(2), 2, {"one": 1.0}).dtype == "float32"
+    finally:
+        jax.config.update("jax_enable_x64", True)
     with jax.disable_jit():
         np.testing.assert_array_equal(scaled(x, 3, {"one": 1.0}), [6.0, 6.0])
 

@@ -38,14 +38,6 @@ USED = {
 
 PROMISED = {"jax", "jax.numpy", "jax.lax", "jax.typing", "jax.stages", "jax.sharding"}
 PROMISED |= {"jax.flatten_util", "jax.scipy.sparse.linalg"}
-    "jax",
-    "jax.numpy",
-    "jax.lax",
-    "jax.typing",
-    "jax.stages",
-    "jax.sharding",
-    "jax.flatten_util",
-)
 
 
 def imports():
