@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import vsr_jax as vsr
-from vsr_jax.analysis import sweep_program, sweep_store as archive
+from vsr_jax.analysis import sweep_program, sweep_store as archive, sweeping
 from vsr_jax.analysis.sweep_labels import labels
 from vsr_jax.analysis.sweep_program import Task
 from vsr_jax.files.scene_file import parse_scene
@@ -72,6 +72,25 @@ def test_cores_change_no_bit(monkeypatch):
         assert result.converged.all()
         tips.append(result["tip"])
     np.testing.assert_array_equal(*tips)
+
+
+def test_the_bar_says_compiling_and_advances_within_a_chunk(monkeypatch, capsys):
+    steps = []
+
+    class Bar(sweeping.tqdm):
+        def update(self, n=1):
+            steps.append((self.desc, n))
+            return super().update(n)
+
+    monkeypatch.setattr(sweeping, "tqdm", Bar)
+    monkeypatch.setattr(sweep_program, "BATCH_SIZE", 4)
+    vsr.sweep(arm(0.006), inputs, model=MODEL)
+    shown = capsys.readouterr().err.strip().split("\r")
+    assert shown[0].startswith("compiling: 0.00 shapes")
+    assert "100%" in shown[-1]
+    assert "23.0/23.0" in shown[-1]
+    assert steps[0] == ("", 4)  # the first part is one batch
+    assert sum(number for _, number in steps) == 23
 
 
 def test_an_error_in_a_thread_ends_the_sweep(monkeypatch):

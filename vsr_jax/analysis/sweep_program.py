@@ -2,8 +2,11 @@
 communication between devices."""
 
 import os
-from collections.abc import Callable, Mapping
-from concurrent.futures import Executor, Future
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Executor
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from ..arm.scene import Scene
 from ..models.base import Model
@@ -24,6 +27,12 @@ from ..typing import VectorLike
 BATCH_SIZE = 256
 """Samples per batch on a CPU: without loads 128 are a tenth faster, since they fit the caches, and
 with constraints 512, which wait less for the arms that take most steps."""
+
+_PART_SECONDS = 0.5
+"""Time [s] that a part should take; then the bar advances."""
+
+_SPLIT = PartitionSpec(None, "samples")
+"""Batches one after the other, the samples of each split over the devices."""
 
 
 def number(samples: PyTree) -> int:
@@ -90,8 +99,8 @@ class Task(eqx.Module):
 
 
 class Program:
-    """A task compiled for a part of a chunk, which is split over the devices and then into batches;
-    `threads` of the host run parts at once.
+    """A task compiled for parts of chunks, batch after batch on each device; `threads` of the host
+    run parts at once, each for about half a second.
 
     Operations on a batch are too small for all cores of a CPU, and threads within one wait for each
     other; so there are as many threads as cores. On other devices a second one starts the next part
@@ -99,7 +108,8 @@ class Program:
 
     The batch size is `BATCH_SIZE` on a CPU and all that a device has of a chunk on others; it is
     reduced to meet the bound on memory. On a CPU it does not depend on samples, chunk or devices,
-    because rounding may depend on it.
+    because rounding may depend on it. The number of batches is an argument of the program: the
+    first parts are one batch, later ones as many as the time of those before them suggests.
 
     **Arguments:** `task`; `samples`: all samples, NumPy arrays; `chunk`: samples per chunk; `mesh`:
     the devices; `memory`: bound on memory [bytes].
@@ -108,15 +118,16 @@ class Program:
     def __init__(self, task: Task, samples: PyTree, chunk: int, mesh: Mesh, memory: int):
         self.chunk, self._samples, self._mesh = chunk, samples, mesh
         self._task = jax.tree.map(lambda x: jnp.asarray(x) if eqx.is_array(x) else x, task)
+        self._batches = 1
         devices = mesh.devices.size
         on_cpu = mesh.devices.flat[0].platform == "cpu"
         self.threads = max(1, cores() // devices) if on_cpu else 2
         at_once = devices * self.threads if on_cpu else devices
-        batch_size = BATCH_SIZE if on_cpu else -(-chunk // devices)
+        total, batch_size = number(samples), BATCH_SIZE if on_cpu else -(-chunk // devices)
         while True:
-            self._batch_size = batch_size
-            self._rows = devices * batch_size * -(-chunk // (at_once * batch_size))
-            lowered = _solved.lower(self._task, self._placed(range(0, 1)), batch_size, mesh)  # pyright: ignore[reportFunctionMemberAccess]
+            self._rows = devices * batch_size
+            self._most = min(-(-chunk // self._rows), -(-total // (at_once * batch_size)))
+            lowered = _solved.lower(self._task, self._placed(range(0, 1)), jnp.int32(1), mesh)  # pyright: ignore[reportFunctionMemberAccess]
             self._compiled = lowered.compile()
             needed = at_once * self._compiled.compiled.memory_analysis().temp_size_in_bytes
             if needed <= memory:
@@ -129,15 +140,24 @@ class Program:
             admitted = max(1, batch_size * memory // needed)
             batch_size = min(batch_size // 2, 1 << (admitted.bit_length() - 1))
 
-    def begin(self, index: int, pool: Executor) -> list[Future]:
-        """Begins a chunk: the outputs of its parts."""
-        first = index * self.chunk
-        last = first + self.samples_in(index)
-        parts = (
-            range(place, min(place + self._rows, last)) for place in range(first, last, self._rows)
-        )
-        # placed here: the precision of JAX may be that of a thread
-        return [pool.submit(self._solve, self._placed(part), len(part)) for part in parts]
+    def solved(
+        self, chunks: Iterable[int], pool: Executor
+    ) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+        """The outputs of the parts of chunks in order, with their chunk; later parts are solved
+        meanwhile."""
+        ahead = deque()
+        for index in chunks:
+            start, last = index * self.chunk, index * self.chunk + self.samples_in(index)
+            while start < last:
+                part = range(start, min(start + self._rows * self._batches, last))
+                # placed here: the precision of JAX may be that of a thread
+                ahead.append((index, pool.submit(self._solve, self._placed(part), len(part))))
+                start = part.stop
+                if len(ahead) > 2 * self.threads:
+                    done, future = ahead.popleft()
+                    yield done, future.result()
+        for done, future in ahead:
+            yield done, future.result()
 
     def samples_in(self, index: int) -> int:
         """Number of samples in a chunk."""
@@ -145,15 +165,21 @@ class Program:
 
     def _solve(self, samples: PyTree, count: int) -> dict[str, np.ndarray]:
         """Outputs of a part, of its first `count` samples."""
-        outputs = self._compiled(self._task, samples, self._batch_size, self._mesh)
-        return {name: np.asarray(x)[:count] for name, x in outputs.items()}
+        start, batches = time.perf_counter(), -(-count // self._rows)
+        outputs = self._compiled(self._task, samples, jnp.int32(batches), self._mesh)
+        # copies: the arrays have room for the largest part
+        found = {name: np.array(np.asarray(x)[:count]) for name, x in outputs.items()}
+        wanted = batches * _PART_SECONDS / (time.perf_counter() - start)
+        self._batches = int(np.clip(wanted, 1, self._most))
+        return found
 
     def _placed(self, part: range) -> PyTree:
-        """The samples of a part on the devices, padded with copies of the last one."""
-        place = np.minimum(part.start + np.arange(self._rows), part.stop - 1)
+        """The samples of a part on the devices, batch by batch, padded with copies of the last
+        one."""
+        place = np.minimum(part.start + np.arange(self._most * self._rows), part.stop - 1)
         return jax.device_put(
-            jax.tree.map(lambda x: x[place], self._samples),
-            NamedSharding(self._mesh, PartitionSpec("samples")),
+            jax.tree.map(lambda x: x[place.reshape(self._most, self._rows)], self._samples),
+            NamedSharding(self._mesh, _SPLIT),
         )
 
 
@@ -165,22 +191,28 @@ def cores() -> int:
 
 
 @eqx.filter_jit
-def _solved(task: Task, samples: PyTree, batch_size: int, mesh: Mesh) -> dict[str, Any]:
-    """Outputs of all samples in batches of `batch_size`; no loop waits for the samples of another
-    device."""
+def _solved(task: Task, samples: PyTree, batches: Array, mesh: Mesh) -> dict[str, Any]:
+    """Outputs of some `batches`, the first of those in `samples`; no loop waits for the samples of
+    another device."""
     arrays, static = eqx.partition(task, eqx.is_array)
 
-    def part(arrays: PyTree, samples: PyTree) -> dict[str, Any]:
-        rows = jax.tree.map(
-            lambda x: x.reshape(len(x) // batch_size, batch_size, *x.shape[1:]), samples
-        )
+    def part(arrays: PyTree, samples: PyTree, batches: Array) -> dict[str, Any]:
         task = eqx.combine(arrays, static)
-        outputs = lax.map(
-            jax.vmap(lambda sample: task(sample)), rows
-        )  # a lambda: JAX prints the name of the mapped function, for a task its whole scene
-        return jax.tree.map(lambda x: x.reshape(len(x) * batch_size, *x.shape[2:]), outputs)
+        # a lambda: JAX prints the name of the mapped function, for a task its whole scene
+        batch = jax.vmap(lambda sample: task(sample))
+        solve = jax.jit(batch, inline=True)  # traced once for its shapes and in the loop
 
-    split = PartitionSpec("samples")
-    return jax.shard_map(
-        part, mesh=mesh, in_specs=(PartitionSpec(), split), out_specs=split, check_vma=False
-    )(arrays, samples)
+        def with_batch(i: Array, outputs: PyTree) -> PyTree:
+            new = solve(jax.tree.map(lambda x: x[i], samples))
+            put = partial(lax.dynamic_update_index_in_dim, index=i, axis=0)
+            return jax.tree.map(put, outputs, new)
+
+        shapes = jax.eval_shape(solve, jax.tree.map(lambda x: x[0], samples))
+        none = jax.tree.map(lambda x: jnp.zeros((number(samples), *x.shape), x.dtype), shapes)
+        return lax.fori_loop(0, batches, with_batch, none)
+
+    specs = PartitionSpec(), _SPLIT, PartitionSpec()
+    outputs = jax.shard_map(part, mesh=mesh, in_specs=specs, out_specs=_SPLIT, check_vma=False)(
+        arrays, samples, batches
+    )
+    return jax.tree.map(lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]), outputs)

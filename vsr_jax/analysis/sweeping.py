@@ -22,9 +22,9 @@ from .sweep_labels import labels
 from .sweep_program import Program, Task, number, stored_outputs
 from .sweep_store import Archive, InMemory
 
-_CHUNK, _CHUNK_ELSEWHERE = 16_384, 65_536
-"""Samples per chunk on CPUs, and per device otherwise: a GPU takes as long for thousands as for a
-hundred."""
+_CHUNK, _CHUNK_ELSEWHERE = 8_192, 65_536
+"""Samples per chunk on CPUs, seconds to minutes of work, and per device otherwise: a GPU takes as
+long for thousands as for a hundred."""
 
 _MEMORY = 1 << 32
 
@@ -109,12 +109,13 @@ def sweep(
     - `out`: a Zarr folder (`pip install "vsr-jax[sweep]"`), which `xarray.open_zarr` reads, see
       below. Each chunk is written when it is done. The same call resumes an interrupted sweep and
       reads a finished one; results are bit-identical on the same devices.
-    - `chunk`: samples per chunk, by default 16,384 on CPUs and 65,536 per device otherwise; an
-      existing folder keeps its own.
+    - `chunk`: samples per chunk, by default 8,192 on CPUs and 65,536 per device otherwise; an
+      existing folder keeps its own. Interrupting a sweep loses about one.
     - `memory`: bound [bytes] on the intermediate values of all that is solved at once, 4 GiB by
       default; it limits the batch size.
     - `devices`: devices of this process to use, all by default.
-    - `progress`: whether to show a bar with rate and remaining time.
+    - `progress`: whether to show a bar with rate and remaining time. It advances by parts of a
+      chunk, each half a second of work, or one batch of 256 samples where that takes longer.
 
     **The store:** `tip` has the dimensions (sample, row, column), `inputs`, `lengths`, `forces` and
     `slack` (sample, actuator), `energy` (sample, part), `q` (sample, dof), or (sample, actuator)
@@ -149,35 +150,36 @@ def sweep(
     )
     with archive.writing():
         if missing:
-            program = Program(task, samples, archive.chunk, local, count("sweep.memory", memory))
-            _run(program, missing, archive, progress and jax.process_index() == 0)
+            memory = count("sweep.memory", memory)
+            with tqdm(
+                desc="compiling",
+                unit=" shapes",
+                unit_scale=True,
+                miniters=1,
+                disable=not progress or jax.process_index() > 0,
+            ) as bar:
+                program = Program(task, samples, archive.chunk, local, memory)
+                _run(program, missing, archive, bar)
     return Sweep(archive.arrays())
 
 
-def _run(program: Program, chunks: list[int], archive: InMemory | Archive, progress: bool) -> None:
-    """Solves chunks; each is written while the next one is solved."""
-    failed, before = 0, None
+def _run(program: Program, chunks: list[int], archive: InMemory | Archive, bar: tqdm) -> None:
+    """Solves chunks part by part; each is written while the next one is solved."""
+    failed, parts = 0, []
+    bar.set_description(refresh=False)
+    bar.reset(sum(map(program.samples_in, chunks)))
     pool = ThreadPoolExecutor(program.threads, thread_name_prefix="sweep")
-    bar = tqdm(
-        total=sum(map(program.samples_in, chunks)),
-        unit=" shapes",
-        unit_scale=True,
-        disable=not progress,
-    )
     try:
-        for index in [*chunks, None]:
-            now = None if index is None else (index, program.begin(index, pool))
-            if before is not None:
-                done, parts = before
-                arrays = _joined([part.result() for part in parts])
-                archive.write(done, arrays)
-                failed += np.count_nonzero(arrays["status"] != Status.CONVERGED)
-                bar.set_postfix(failed=failed, refresh=False)
-                bar.update(program.samples_in(done))
-            before = now
+        for index, part in program.solved(chunks, pool):
+            parts.append(part)
+            failed += np.count_nonzero(part["status"] != Status.CONVERGED)
+            bar.set_postfix(failed=failed, refresh=False)
+            bar.update(number(part))
+            if sum(map(number, parts)) == program.samples_in(index):
+                archive.write(index, _joined(parts))
+                parts = []
     finally:
         pool.shutdown(cancel_futures=True)
-        bar.close()
 
 
 def _joined(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
