@@ -5,13 +5,17 @@ from typing import Any
 import jax
 import matplotlib.pyplot as plt
 import numpy as np
+from jaxtyping import Array
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase, SubFigure
 from matplotlib.lines import Line2D
 
+from ..arm.scene import Scene
 from ..calibration.observation import Markers
 from ..calibration.result import Fit
+from ..models.base import Model
+from ..numerics.compiling import program
 from ..solution.solver import solve
 from .plot import COLORS
 
@@ -71,7 +75,12 @@ def _axis(fit: Fit, group: str, rows: np.ndarray) -> np.ndarray:
     if not rows.any():
         return np.zeros((0, X.size, 3))
     inputs = fit.inputs(fit.problem.data.inputs[rows])
-    return np.asarray(jax.vmap(lambda u: solve(scene, u, model=model).position(X))(inputs))
+    return np.asarray(_positions(scene, inputs, model, X))
+
+
+@program("plot_fit")
+def _positions(scene: Scene, inputs: Array, model: Model | None, X: Array) -> Array:
+    return jax.vmap(lambda u: solve(scene, u, model=model).position(X))(inputs)
 
 
 def _markers(
