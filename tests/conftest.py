@@ -13,15 +13,17 @@ from pathlib import Path
 
 import jax
 
-os.environ.setdefault(
-    "XLA_FLAGS",
-    # XLA ends the process at a flag that it does not know, as this one since JAX 0.11
-    "--xla_cpu_use_fusion_emitters=false " * (jax.__version_info__ < (0, 11))
-    + "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1 "
-    # without these passes XLA takes a quarter less of what remains
-    + "--xla_disable_hlo_passes=simplify-while-loops,while-loop-invariant-code-motion,"
-    + "while-loop-constant-sinking,reshape-mover,simplify-conditional",
-)
+FLAGS = ["--xla_backend_optimization_level=0"]
+# XLA ends the process at a flag that it does not know: others are for versions that were tried
+if jax.__version_info__ < (0, 13):
+    passes = (
+        "simplify-while-loops,while-loop-invariant-code-motion,while-loop-constant-sinking,"
+        "reshape-mover,simplify-conditional"
+    )
+    FLAGS += ["--xla_cpu_parallel_codegen_split_count=1", f"--xla_disable_hlo_passes={passes}"]
+if jax.__version_info__ < (0, 11):
+    FLAGS += ["--xla_cpu_use_fusion_emitters=false"]
+os.environ.setdefault("XLA_FLAGS", " ".join(FLAGS))
 
 os.environ.setdefault("VSR_JAX_CACHE", "off")  # commands run here leave nothing behind
 

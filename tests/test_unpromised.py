@@ -2,6 +2,9 @@
 fails for each that a new version lacks, and for each new use that is not named here."""
 
 import ast
+import os
+import subprocess
+import sys
 from importlib import import_module
 from pathlib import Path
 
@@ -9,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import FLAGS
 
 PACKAGE = Path(__file__).parent.parent / "vsr_jax"
 
@@ -78,6 +82,14 @@ def test_xla_knows_the_options_of_quick_compilation():
     options = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
     program = jax.jit(lambda x: 2 * x).lower(jnp.ones(2))
     np.testing.assert_array_equal(program.compile(compiler_options=options)(jnp.ones(2)), [2, 2])
+
+
+def test_xla_knows_the_flags_of_the_tests():
+    """Otherwise it ends every process of the tests, without a word of which flag."""
+    environment = os.environ | {"XLA_FLAGS": " ".join(FLAGS)}
+    command = [sys.executable, "-c", "import jax; print(jax.numpy.ones(2).sum())"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_a_traced_program_has_equations_constants_and_literals():
