@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import FLAGS
+from xla_flags import FLAGS
 
 PACKAGE = Path(__file__).parent.parent / "vsr_jax"
 
