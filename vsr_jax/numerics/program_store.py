@@ -10,7 +10,7 @@ import os
 import platform
 import re
 import sys
-import tempfile
+from contextlib import suppress
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -139,24 +139,24 @@ def _read(path: Path, lowered: Lowered) -> Compiled | None:
         data = path.read_bytes()
     except OSError:
         return None
+    with suppress(OSError):  # a folder that is only read
+        os.utime(path)
     device = jax.local_devices(backend="cpu")[0]
     try:
-        found = serialize_executable.deserialize_and_load(
+        return serialize_executable.deserialize_and_load(
             data, lowered.in_tree, lowered.out_tree, device.client, [device]
         )
-        os.utime(path)  # used now
     except Exception:  # a damaged file, of whatever kind: the program is compiled again
         return None
-    return found
 
 
 def _write(path: Path, program: Compiled) -> None:
     """Stores a program, in one step for other processes. Nothing is stored where XLA cannot, or
     where the disk is full."""
+    temporary = path.with_suffix(f".{os.getpid()}")
     try:
-        data = serialize_executable.serialize(program)[0]
-        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-            file.write(data)
-        os.replace(file.name, path)
+        temporary.write_bytes(serialize_executable.serialize(program)[0])
+        os.replace(temporary, path)
     except (ValueError, NotImplementedError, RuntimeError, OSError):
-        return
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
