@@ -122,6 +122,17 @@ def test_a_damaged_program_is_compiled_again(monkeypatch, tmp_path, content):
     assert path.stat().st_size == pytest.approx(len(whole), rel=0.01)
 
 
+def test_a_program_that_cannot_be_stored_runs(monkeypatch, tmp_path):
+    monkeypatch.setenv("VSR_JAX_CACHE", str(tmp_path))
+
+    @program("called")
+    def called(x):
+        return jax.pure_callback(lambda x: 2 * np.asarray(x), x, x)
+
+    assert called(jnp.ones(())) == 2.0
+    assert not programs(tmp_path)
+
+
 def test_a_folder_that_cannot_be_written_is_not_used(monkeypatch, tmp_path):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("VSR_JAX_CACHE", str(tmp_path / "file" / "folder"))

@@ -151,12 +151,11 @@ def _read(path: Path, lowered: Lowered) -> Compiled | None:
 
 
 def _write(path: Path, program: Compiled) -> None:
-    """Stores a program, in one step for other processes. Nothing is stored where XLA cannot, or
-    where the disk is full."""
+    """Stores a program, in one step for other processes."""
     temporary = path.with_suffix(f".{os.getpid()}")
     try:
         temporary.write_bytes(serialize_executable.serialize(program)[0])
         os.replace(temporary, path)
-    except (ValueError, NotImplementedError, RuntimeError, OSError):
+    except Exception:  # a full disk; a program that JAX cannot store, with a callback or a sort
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
