@@ -275,6 +275,19 @@ def test_a_program_goes_through_all_transformations():
     np.testing.assert_allclose(jax.vmap(cube)(jnp.arange(3.0)), [0.0, 1.0, 8.0])
 
 
+def test_a_static_function_may_close_over_traced_numbers():
+    @program("applied")
+    def applied(function, x):
+        return function(x)
+
+    def cube(size):
+        return applied(lambda x: size * x**3, jnp.array(2.0))
+
+    assert jax.grad(cube)(5.0) == jax.jit(jax.grad(cube))(5.0) == 8.0
+    np.testing.assert_array_equal(jax.vmap(cube)(jnp.arange(3.0)), [0.0, 8.0, 16.0])
+    assert cube(3.0) == 24.0
+
+
 def test_a_program_is_that_of_the_arguments_and_settings():
     @program("scaled")
     def scaled(x, factor, more):

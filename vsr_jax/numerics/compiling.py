@@ -99,37 +99,45 @@ class Program:
         settings = tuple([getattr(jax.config, setting) for setting in _SETTINGS])
         key = structure, static, kinds, settings
         if key not in self._kinds:
-            self._kinds[key] = (
-                self._compiled(structure, static, arrays) if _on_host(arrays) else None
-            )
+            self._kinds[key] = self._compiled(structure, static, arrays)
         return self._kinds[key], arrays
 
-    def _compiled(self, structure: Any, static: tuple, arrays: list[Array]) -> "_Kind":
+    def _compiled(self, structure: Any, static: tuple, arrays: list[Array]) -> "_Kind | None":
         text = f"vsr_jax: compiling {self._name}"
         with message_when_slow(text), garbage_kept():
-            return _Kind(self._function, structure, static, arrays)
+            kind = _Kind(self._function, structure, static) if _on_host(arrays) else None
+            return kind if kind is not None and kind.prepare(arrays) else None
 
 
 class _Kind:
     """A program for one kind of arguments: their structure, and their static leaves, with None in
     place of arrays."""
 
-    def __init__(self, function: Callable, structure: Any, static: tuple, arrays: list[Array]):
+    def __init__(self, function: Callable, structure: Any, static: tuple):
+        self._function, self._given = function, (structure, static)
+        self._returned: tuple[Any, list[tuple | None]] = None, []
         self._ran, self._improving = 0.0, False
-        self._structure: Any = None
-        self._static: list[tuple | None] = []
 
-        def run(arrays: list[Array]) -> list[Array]:
-            args, kwargs = jax.tree.unflatten(structure, _filled(static, arrays))
-            leaves, self._structure = jax.tree.flatten(function(*args, **kwargs))
-            self._static = [None if eqx.is_array(x) else (x,) for x in leaves]
-            return [x for x in leaves if eqx.is_array(x)]
-
-        lowered, quick = jax.jit(run).lower(arrays), _quick_options()
+    def prepare(self, arrays: list[Array]) -> bool:
+        """Compiles the program; False where it has other inputs than the arrays, traced numbers
+        that a function among the static leaves closes over."""
+        traced = jax.jit(self._flat).trace(arrays)
+        if len(traced.jaxpr.in_avals) != len(arrays):
+            return False
+        lowered, quick = traced.lower(), _quick_options()
         best = program_store.stored(lowered, {}) if quick else None
         self._run = best or program_store.compiled(lowered, quick)
         self._lowered = lowered if quick and best is None else None
         self._long = LONG * len(lowered.as_text())
+        return True
+
+    def _flat(self, arrays: list[Array]) -> list[Array]:
+        """The arrays that the function returns, from those that it takes."""
+        structure, static = self._given
+        args, kwargs = jax.tree.unflatten(structure, _filled(static, arrays))
+        leaves, structure = jax.tree.flatten(self._function(*args, **kwargs))
+        self._returned = structure, [None if eqx.is_array(x) else (x,) for x in leaves]
+        return [x for x in leaves if eqx.is_array(x)]
 
     def __call__(self, arrays: list[Array]) -> Any:
         if self._lowered is None:
@@ -141,7 +149,8 @@ class _Kind:
             if self._ran > self._long and not self._improving:
                 self._improving = True
                 _improver.add(self)
-        return jax.tree.unflatten(self._structure, _filled(self._static, found))
+        structure, static = self._returned
+        return jax.tree.unflatten(structure, _filled(static, found))
 
     def improve(self) -> None:
         """Compiles the program with all optimizations, and runs that from now on."""
