@@ -21,8 +21,9 @@ os.environ.setdefault("VSR_JAX_CACHE", "off")  # commands run here leave nothing
 
 import jaxtyping
 
-CHECKED = "vsr_jax" if os.environ.get("SHAPE_CHECKS") != "off" else ()
-with jaxtyping.install_import_hook(CHECKED, "beartype.beartype"):
+with jaxtyping.install_import_hook(
+    "vsr_jax" if os.environ.get("SHAPE_CHECKS") != "off" else (), "beartype.beartype"
+):
     import vsr_jax
 
     for name in vsr_jax.__all__:  # the face imports its modules when their names are first used
