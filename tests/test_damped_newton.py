@@ -26,6 +26,23 @@ def solved(stiffness, says_definite, dtype, cubic=1.0):
     return iterated(damped_newton(evaluate, measures, jnp.zeros(2, dtype), floor))
 
 
+def test_a_softened_problem_alone_is_no_solution():
+    """Where constraints are exact, the residual is not finite."""
+
+    def solved(hardest):
+        def evaluate(x, damping, share, loose):
+            residual = jnp.where(share > hardest, jnp.nan, x - 1)
+            step, no = residual / (1 + damping), jnp.array(False)
+            size = jnp.linalg.norm(step)
+            return Damped(step, size, residual, size, jnp.isfinite(size), no, no)
+
+        measures = Measures(jnp.vdot, jnp.linalg.norm, jnp.array([0.6, 0.8]), jnp.vdot)
+        return iterated(damped_newton(evaluate, measures, jnp.zeros(2), jnp.array(1e-15), stages=4))
+
+    assert solved(2.0).converged
+    assert not solved(1.9).converged
+
+
 def wrong_near_the_root(size, damping):
     return (size > 1e-4) | (damping > 0)
 

@@ -230,8 +230,7 @@ class _Method(NamedTuple):
     def root(self, state: _State) -> Root:
         """The result."""
         guard = state.guard
-        sound = guard.merit <= self.accepted
-        return Root(state.x, sound, guard.definite, guard.spent, guard.loose)
+        return Root(state.x, self._sound(guard), guard.definite, guard.spent, guard.loose)
 
     def advance(self, state: _State) -> _State:
         """The state after one evaluation."""
@@ -267,6 +266,11 @@ class _Method(NamedTuple):
         )
         x = select(go & trial.taken, finished, state.x)
         return self._again(_State(x, step, earlier, guard), old, trial, go)
+
+    def _sound(self, guard: Guard) -> Array:
+        """Which problems have an accepted residual, with constraints that are exact."""
+        sound = guard.merit <= self.accepted
+        return sound & (guard.applied == self.levels) if self.stages else sound
 
     def _going(self, guard: Guard) -> Array:
         """Which problems are not solved."""
@@ -361,7 +365,7 @@ class _Method(NamedTuple):
             ended = ~self.busy(state)
             guard = rules.loosened(guard, trial.hard, ended, self.levels)
             if not self.twice:
-                sound = guard.definite & (guard.merit <= self.accepted)
+                sound = guard.definite & self._sound(guard)
                 failed = (ended & ~sound) | (guard.spent >= _FIRST_STAGES)
         again = once(~old.gradual & failed)
         guard = select(again, self.second._replace(spent=guard.spent), guard)
