@@ -95,6 +95,30 @@ def test_a_tip_rests_on_what_it_presses():
     np.testing.assert_allclose(eq.tip[2, 3], height + radius, atol=1e-8 * L)
 
 
+def test_an_arm_on_a_floor_says_that_its_contacts_are_loosened():
+    """The tip of a light arm touches the floor, a heavy one lies along it; contacts stay loosened
+    in a solve that starts from such a one."""
+
+    def on_floor(density, start=None):
+        return solved(
+            vsr.Gravity(),
+            arm=rod(young=2e5, density=density),
+            obstacles=vsr.Plane((0, 0, 1), (0, 0, -0.02)),
+            free_strains=("bending_y",),
+            model=vsr.StrainDependent(8),
+            start=start,
+        )
+
+    eqs = jax.jit(jax.vmap(on_floor))(jnp.array([30.0, 5000.0]))
+    heavy = jax.tree.map(lambda x: x[1], eqs)
+    lighter = jax.jit(on_floor)(jnp.array(4000.0), heavy)
+    assert np.all(eqs.converged)
+    assert bool(lighter.converged)
+    np.testing.assert_array_equal(eqs.loosened, [False, True])
+    assert bool(lighter.loosened)
+    assert lighter.steps < heavy.steps
+
+
 @pytest.mark.slow
 def test_contacts_of_an_arm_along_a_wall_push_only_where_the_gap_is_closed():
     """In a bent tube, and on a floor from a solution near by: a first solve there fails, and only

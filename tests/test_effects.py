@@ -70,6 +70,15 @@ def test_free_strains_give_the_solve_their_size(plain):
     assert bending["sqrt"] <= plain["sqrt"] - 4
 
 
+def test_only_constraints_can_be_loosened():
+    def loosened(**around):
+        scene = vsr.Scene(ARM, [vsr.Tendon(PATH)], [vsr.Gravity()], **around)
+        return jax.eval_shape(lambda inputs: STEPS.solve(scene, inputs).loosened, jnp.zeros(1))
+
+    assert loosened() is None
+    assert loosened(held=vsr.Held(position=(0.3, 0.0, 0.0))) is not None
+
+
 def test_an_end_costs_a_mask_only(plain):
     ended = operations(vsr.Scene(ARM, [vsr.Tendon(PATH, end=0.2)]))
     assert ended["while"] == plain["while"]

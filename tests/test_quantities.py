@@ -10,6 +10,7 @@ import pytest
 from conftest import central_differences
 
 import vsr_jax as vsr
+from vsr_jax.analysis.arms import Arms
 from vsr_jax.solution import QUANTITIES, quantity
 from vsr_jax.solution.quantities import along_arm
 
@@ -159,3 +160,17 @@ def test_an_equilibrium_prints_what_a_person_asks_first(solved):
     text = str(solved)
     for part in ("converged", "float64", "tip", "estimated error", "stability margin"):
         assert part in text
+
+
+def test_an_equilibrium_says_whether_it_is_loosened(solved):
+    loosened = vsr.Equilibrium(
+        solved.scene, solved.inputs, solved.model, solved.outcome._replace(loosened=jnp.array(True))
+    )
+    assert not solved.loosened
+    assert str(loosened).splitlines() == [
+        *str(solved).splitlines(),
+        "  loosened         constraints, on the way to the solution",
+    ]
+    assert loosened.heading[2:] == ("  loosened   constraints, on the way to the solution",)
+    assert len(solved.heading) == 2
+    assert Arms.of(loosened).each(lambda eq: eq.loosened).all()

@@ -25,8 +25,7 @@ class Arms(eqx.Module):
     @classmethod
     def of(cls, eq: Equilibrium) -> "Arms":
         """One arm: the scene solved for one set of inputs."""
-        outcome = Outcome(eq.state, eq.sound_forces, eq.status, eq.steps)
-        sets = jax.tree.map(lambda x: x[None], (eq.inputs, outcome))
+        sets = jax.tree.map(lambda x: x[None], (eq.inputs, eq.outcome))
         return cls(eq.scene, sets[0], eq.model, sets[1])
 
     def each(self, function: Callable, *arrays: Array) -> PyTree:

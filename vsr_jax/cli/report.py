@@ -66,10 +66,10 @@ def record(eq: Equilibrium, found: Summary | None) -> dict[str, Any]:
 
     **Arguments:** `eq`: one equilibrium; `found`: its `summary`.
 
-    **Returns:** `model`, `precision`, `inputs`, `status` as a message, `converged`, `steps`; `tip`
-    (pose, 4 x 4); at the stations `X` [m] the `position` [m] and the `strain` (k [1/m], u [-]); for
-    each thread the `force` [N] at its start, negative where it pulls, the `length` [m] and the
-    `slack` [m]; `stability`.
+    **Returns:** `model`, `precision`, `inputs`, `status` as a message, `converged`, `steps`,
+    `loosened`; `tip` (pose, 4 x 4); at the stations `X` [m] the `position` [m] and the `strain`
+    (k [1/m], u [-]); for each thread the `force` [N] at its start, negative where it pulls, the
+    `length` [m] and the `slack` [m]; `stability`.
     """
     solved: dict[str, Any] = dict.fromkeys(
         ("tip", "X", "position", "strain", "force", "length", "slack", "stability")
@@ -95,6 +95,7 @@ def record(eq: Equilibrium, found: Summary | None) -> dict[str, Any]:
         "status": eq.message,
         "converged": bool(eq.converged),
         "steps": int(eq.steps),
+        "loosened": bool(eq.loosened),
         **solved,
     }
 

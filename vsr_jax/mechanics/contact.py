@@ -118,6 +118,9 @@ class Contacts(Coupling):
     def loosened(self, loose: Array) -> "Contacts":
         return replace(self, loose=jnp.maximum(self.loose, loose.astype(self.loose.dtype)))
 
+    def was_loosened(self, loose: Array) -> Array:
+        return loose | (self.loose > 0)
+
     def as_loose_as(self, other: Coupling) -> "Contacts":
         return self.loosened(other.loose) if isinstance(other, Contacts) else self
 

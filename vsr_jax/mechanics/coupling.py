@@ -79,6 +79,15 @@ class ArmProblem(NamedTuple):
             return self
         return self._replace(couplings=tuple(one.loosened(loose) for one in self.couplings))
 
+    def was_loosened(self, loose: Array | None) -> Array | None:
+        """Whether constraints were loosened, by a solve that ended `loose` or by one that it began
+        from; None without constraints."""
+        if loose is None or not self.softens:
+            return None
+        for coupling in self.couplings:
+            loose = coupling.was_loosened(loose)
+        return loose
+
     def bowed(self, angle: Array) -> "ArmProblem":
         """The problem of an arm that is twisted by an angle [rad] at rest, and bent by as much in a
         plane that turns along it. What is in balance by symmetry alone is not with such a rest
@@ -196,6 +205,10 @@ class Coupling(eqx.Module):
         """The coupling with a rougher discretization where `loose` is true, for what is not solved
         without; the same by default."""
         return self
+
+    def was_loosened(self, loose: Array) -> Array:
+        """Whether it is loosened, or a solve ended `loose`; only the latter by default."""
+        return loose
 
     def as_loose_as(self, other: "Coupling") -> "Coupling":
         """The coupling, loosened where another one is that it begins from; the same by default."""

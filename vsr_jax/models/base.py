@@ -86,13 +86,15 @@ class Nodes(NamedTuple):
 
 class Outcome(NamedTuple):
     """Result of a model's solve: its own state (finite even where it failed), the thread forces [N]
-    at their start, a `Status`, the Newton steps, and its nodes, if they are at hand."""
+    at their start, a `Status`, the Newton steps, its nodes, if they are at hand, and whether
+    constraints were loosened on the way, None for a scene or a model without."""
 
     state: Any
     forces: Forces
     status: Array
     steps: Array
     nodes: Nodes | None = None
+    loosened: Array | None = None
 
 
 class Near(NamedTuple):

@@ -151,7 +151,8 @@ class StrainDependent(SteppedModel):
         coupled = jax.tree.map(lambda x: jnp.where(sound, x, 0.0), unknown.coupled)
         state = ArmSolution(xi, coupled, problem.couplings)
         nodes = Nodes(problem.grid, xi, problem.sections, shares)
-        return Outcome(state, forces_where(sound, forces), status, steps, nodes)
+        loosened = problem.was_loosened(loose)
+        return Outcome(state, forces_where(sound, forces), status, steps, nodes, loosened)
 
     def node_strain(self, scene: Scene, state: ArmSolution) -> Vector:
         return state.xi

@@ -5,7 +5,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..arm.discs import on_chords, points_at
 from ..arm.scene import Scene
@@ -34,6 +34,9 @@ from .quantities import (
 from .stability import extreme, extreme_supported
 from .summary import Summary, summary_of
 
+_LOOSENED = "constraints, on the way to the solution"
+"""What a report says of an equilibrium that is `loosened`."""
+
 
 class Equilibrium(Solved):
     """A solved scene.
@@ -56,12 +59,32 @@ class Equilibrium(Solved):
     steps: Array
     _forces: Vector
     state: Any
+    _loosened: Array | None
 
     def __init__(
         self, scene: Scene, inputs: Float[Array, " inputs"], model: Model, outcome: Outcome
     ):
         self.scene, self.inputs, self.model = scene, inputs, model
         self.state, self._forces, self.status, self.steps = outcome[:4]
+        self._loosened = outcome.loosened
+
+    @property
+    def outcome(self) -> Outcome:
+        """The outcome of its model, from which an equal `Equilibrium` can be made."""
+        forces = self.sound_forces
+        return Outcome(self.state, forces, self.status, self.steps, loosened=self._loosened)
+
+    @property
+    def loosened(self) -> Bool[Array, "..."]:
+        """Whether constraints were loosened: the solve, or the one that it started from, found no
+        stable equilibrium without. The result is balanced all the same, and held sections are exact
+        in it. Contacts stay loosened: between them the arm may pass an obstacle by up to
+        $h^2 / (8 L)$, with steps of length h on an arm of length L. Of several equilibria the
+        result may be another one than that without. Always false without held sections and
+        obstacles."""
+        if self._loosened is None:
+            return jnp.zeros(jnp.shape(self.status), bool)
+        return self._loosened
 
     @property
     def message(self) -> str:
@@ -69,11 +92,13 @@ class Equilibrium(Solved):
         return Status(int(self.status)).message
 
     @property
-    def heading(self) -> tuple[str, str]:
-        """First lines of a report of one equilibrium: its status and its effects."""
+    def heading(self) -> tuple[str, ...]:
+        """First lines of a report of one equilibrium: its status, its effects and whether it is
+        `loosened`."""
         method = f"{type(self.model).__name__}, {self.inputs.dtype}, {int(self.steps)} steps"
         effects = ", ".join(self.scene.effects) or "none"
-        return f"  status     {self.message} ({method})", f"  effects    {effects}"
+        lines = f"  status     {self.message} ({method})", f"  effects    {effects}"
+        return (*lines, f"  loosened   {_LOOSENED}") if bool(self.loosened) else lines
 
     def summary(self, X: VectorLike = 61, values: Sequence[str] = ()) -> Summary:
         """All quantities along the arm, from one compiled program, and selected other ones.
@@ -255,6 +280,7 @@ class Equilibrium(Solved):
         if is_traced(self.status) or jnp.ndim(self.status) > 0 or not bool(self.converged):
             return repr(self)
         tip, error = self.tip, self.error.tip
+        loosened = (f"  loosened         {_LOOSENED}",) if bool(self.loosened) else ()
         return "\n".join(
             (
                 f"Equilibrium: converged in {int(self.steps)} steps",
@@ -262,6 +288,7 @@ class Equilibrium(Solved):
                 f"  tip              ({', '.join(f'{float(x):.6g}' for x in tip[:3, 3])}) m",
                 f"  estimated error  {float(error):.1e} m",
                 f"  stability margin {float(self.stability):.3g}",
+                *loosened,
             )
         )
 
