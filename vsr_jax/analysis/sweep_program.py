@@ -123,10 +123,10 @@ class Program:
         on_cpu = mesh.devices.flat[0].platform == "cpu"
         self.threads = max(1, cores() // devices) if on_cpu else 2
         at_once = devices * self.threads if on_cpu else devices
-        total, batch_size = number(samples), BATCH_SIZE if on_cpu else -(-chunk // devices)
+        batch_size = BATCH_SIZE if on_cpu else -(-chunk // devices)
         while True:
             self._rows = devices * batch_size
-            self._most = min(-(-chunk // self._rows), -(-total // (at_once * batch_size)))
+            self._most = -(-chunk // (at_once * batch_size))
             lowered = _solved.lower(self._task, self._placed(range(0, 1)), jnp.int32(1), mesh)  # pyright: ignore[reportFunctionMemberAccess]
             self._compiled = lowered.compile()
             needed = at_once * self._compiled.compiled.memory_analysis().temp_size_in_bytes
