@@ -256,6 +256,8 @@ def test_nothing_looks_for_garbage_while_a_program_is_traced(enabled):
     finally:
         gc.enable()
     assert seen == [False, False]
+    jax.jit(traced)(jnp.ones((1, 1)))
+    assert seen == [False, False, False]
 
 
 def test_a_program_goes_through_all_transformations():

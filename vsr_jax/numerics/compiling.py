@@ -81,7 +81,10 @@ class Program:
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         kind, arrays = self._kind(args, kwargs)
-        return self._traced(*args, **kwargs) if kind is None else kind(arrays)
+        if kind is not None:
+            return kind(arrays)
+        with garbage_kept():
+            return self._traced(*args, **kwargs)
 
     def compile(self, *args: Any, **kwargs: Any) -> None:
         """Compiles the program for such arguments, without running it."""
