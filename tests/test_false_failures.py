@@ -13,6 +13,7 @@ from benchmarks.false_failures import search
 from benchmarks.load_steps import Arm
 from benchmarks.ordinary_scenes import STRUCTURES, built
 from vsr_jax.mechanics import elimination_nodes
+from vsr_jax.numerics import compiling
 
 GREENHILL = 7.8373
 
@@ -104,7 +105,7 @@ def test_two_unstable_motions_that_the_pivots_miss_are_found(monkeypatch):
 
     def real_margin():
         """Least real eigenvalue of the independent tangent at the solution."""
-        jax.clear_caches()
+        compiling.drop_programs()
         eq = vsr.solve(*built(structure, numbers), model=vsr.StrainDependent(24), throw=True)
         strain = np.asarray(eq.strain(arm.middle * L)) * np.array([L, L, L, 1, 1, 1])
         found = arm.balance(strain, np.zeros(0), 1.0)
@@ -116,4 +117,4 @@ def test_two_unstable_motions_that_the_pivots_miss_are_found(monkeypatch):
     with monkeypatch.context() as blind:
         blind.setattr(elimination_nodes, "_ASYMMETRIC", np.inf)
         assert real_margin() < -0.5
-    jax.clear_caches()
+    compiling.drop_programs()

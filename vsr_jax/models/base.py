@@ -366,7 +366,10 @@ def classify(
     if sections.paths:
         path, reach = sections.every_path, sections.every_reach
         rest = thread_tangent(sections.rest, path)
-        left = dot(thread_tangent(xi, path), rest) <= _NOTHING * dot(rest, rest)
+        square = dot(rest, rest)
+        left = dot(thread_tangent(xi, path), rest) <= _NOTHING * square
+        # a path without length at rest has the direction of its rounding errors
+        left = left & (square > (8 * jnp.finfo(square.dtype).eps) ** 2)
         collapsed = collapsed | jnp.any(left if reach is None else left & (reach > 0))
         pulling = _exhausted(tau, path, sections) if loaded else jnp.all(together(tau) <= 0)
         collapsed = collapsed | jnp.any(~balanced & pulling)
