@@ -11,13 +11,17 @@ Positions are computed only if a load depends on them. Wrenches jump only at the
 for contact forces (see `touch`).
 """
 
+from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
 
 from ..numerics.component import Forces, Vector
+from ..numerics.implicit import change_of
 from ..numerics.magnus import magnus_6
 from ..numerics.once import once
 from ..numerics.quadrature import (
@@ -31,7 +35,7 @@ from ..numerics.quadrature import (
     weighted,
     within,
 )
-from ..numerics.se3 import base_pose, stacked_rotation
+from ..numerics.se3 import base_pose, stacked_rotation, stacked_turn
 from ..numerics.stacked import (
     components,
     cross,
@@ -141,15 +145,16 @@ def partial_rotation(k: Array, h: Array, sigma: Array | float) -> Array:
     return magnus_6(mean, slope, h * sigma * sigma * b[2], cross)
 
 
+@jax.custom_jvp
 def rotations(k: Array, h: Array, base: Array | None) -> tuple[Array, Array, Array]:
-    """Rotation at the start of every step (3, 3, steps, *arms), at the nodes (3, 3, stages, steps,
+    r"""Rotation at the start of every step (3, 3, steps, *arms), at the nodes (3, 3, stages, steps,
     *arms) and at the end of the arm, from the angular strain (3, stages, steps, *arms) at the
-    nodes."""
-    # within each step up to its nodes, and up to its end
-    parts = jnp.append(jnp.asarray(gauss_legendre(k.shape[1])[0], h.dtype), 1.0)
-    within_step = stacked_rotation(
-        once(partial_rotation(k[:, :, None], h, parts.reshape(-1, *(1,) * h.ndim)))
-    )
+    nodes.
+
+    Its derivative is $\delta R = \tilde\theta R$ with the sum $\theta$ of all turns before, in
+    the world frame: sums along the arm, without a pass.
+    """
+    within_step = stacked_rotation(once(_within_steps(k, h)))
     whole = jnp.moveaxis(within_step[:, :, -1], 2, 0)
     matrix = base_pose(base, h.dtype)[:3, :3]
     first = jnp.broadcast_to(
@@ -159,6 +164,35 @@ def rotations(k: Array, h: Array, base: Array | None) -> tuple[Array, Array, Arr
     end, starts = lax.scan(lambda R, E: (matmul(R, once(E)), R), first, whole)
     starts = jnp.moveaxis(starts, 0, 2)
     return starts, matmul(starts[:, :, None], within_step[:, :, :-1]), end
+
+
+def _within_steps(k: Array, h: Array) -> Array:
+    """Rotation vectors from the start of each step to its nodes, and to its end."""
+    parts = jnp.append(jnp.asarray(gauss_legendre(k.shape[1])[0], h.dtype), 1.0)
+    return partial_rotation(k[:, :, None], h, parts.reshape(-1, *(1,) * h.ndim))
+
+
+@partial(rotations.defjvp, symbolic_zeros=True)
+def _rotations_jvp(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
+    k, h, base = primals
+    starts, R, end = rotations(k, h, base)
+    ends = jnp.concatenate([starts[:, :, 1:], end[:, :, None]], axis=2)
+    turn = stacked_turn(_within_steps(k, h), change_of(_within_steps, (k, h), tangents[:2]))
+    turn = matvec(jnp.concatenate([R, ends[:, :, None]], axis=2), turn)
+    of_step = turn[:, -1]
+    until = jnp.cumsum(of_step, axis=1)
+    before = until - of_step
+    theta = before, before[:, None] + turn[:, :-1], until[:, -1]
+    changes = tuple(matmul(skew(t), x) for t, x in zip(theta, (starts, R, end), strict=True))
+    if base is not None and not isinstance(tangents[2], SymbolicZero):
+        first = matmul(tangents[2][:3, :3], transpose(base[:3, :3]))
+        first = first.reshape(3, 3, *first.shape[2:], *(1,) * (end.ndim - first.ndim))
+        changes = (
+            changes[0] + matmul(first[:, :, None], starts),
+            changes[1] + matmul(first[:, :, None, None], R),
+            changes[2] + matmul(first, end),
+        )
+    return (starts, R, end), changes
 
 
 def react(xi: Vector, grid: Grid, loads: Loading, forces: Forces = ()) -> Reaction:
@@ -268,40 +302,6 @@ def _with_moment(wrench: Array, moment: Array) -> Array:
     """A wrench (6, ...) and a moment more."""
     total = rows(wrench, 0, 3) + moment
     return jnp.concatenate([total, jnp.broadcast_to(rows(wrench, 3, 6), total.shape)])
-
-
-def reaction_change(change: Array, along: Reaction, slopes: Slopes, grid: Grid) -> Array:
-    r"""Change $\delta\Lambda$ of the reaction with a change $(\kappa, \upsilon)$ of the strain, of
-    the order of the nodes' quadrature.
-
-    With the rotation $\theta(X) = \int_0^X R \kappa \, ds$ of the sections in the world frame,
-    their displacement $\rho$ with $\rho' = \theta \times p' + R \upsilon$, and the changes
-    $\delta c$, $\delta f$ of the loads by their `slopes`
-
-    $$\delta n = \int_X^L \delta f \, ds, \quad
-    \delta m = \int_X^L (\rho' \times n + p' \times \delta n + \delta c) \, ds, \quad
-    \delta\Lambda = R^T (\delta m - \theta \times m, \delta n - \theta \times n);$$
-
-    wrenches at points add their changes before them. All arrays broadcast: several changes can be
-    stacked in an axis behind those of the nodes, where the other arguments have size 1.
-    """
-    R, m, n = along.rotation, rows(along.world, 0, 3), rows(along.world, 3, 6)
-    bend = matvec(R, rows(change, 0, 3))
-    theta = before(bend, grid)
-    moving = cross(theta, along.axis) + matvec(R, rows(change, 3, 6))
-    delta = jnp.concatenate([jnp.zeros_like(theta)] * 2)
-    motion = jnp.concatenate([bend, moving]) if slopes.motion == 6 else bend
-    for point in slopes.points:
-        there = sum_along(point.before * motion, grid)
-        delta = delta + point.before * matvec(point.matrix[:, :, None, None], there)
-    if slopes.density is not None:
-        here = jnp.concatenate([theta, before(moving, grid)]) if slopes.motion == 6 else theta
-        delta = delta + beyond(matvec(slopes.density, here), grid)
-    moved = cross(moving, n)
-    if slopes.motion:
-        moved = moved + cross(along.axis, rows(delta, 3, 6))
-    dm = rows(delta, 0, 3) + beyond(moved, grid) - cross(theta, m)
-    return turned(transpose(R), jnp.concatenate([dm, rows(delta, 3, 6) - cross(theta, n)]))
 
 
 def react_at(

@@ -4,9 +4,8 @@ couplings.
 The load term is the virtual work of the loads, integrated by parts: one pass of rotations to the
 tip and one of wrenches to the base (see `reaction`), without assembling a Jacobian. The unknowns
 are the coordinates and those of the couplings that do not follow from the strain and its derivative
-along the arm, which the basis gives. Newton's method uses the tangent $\int B_q^T (H B_q -
-\delta\Lambda) dX$ in single precision; derivatives of the solution use the exact tangent of the
-discrete residual, by forward differentiation.
+along the arm, which the basis gives. The tangent is the derivative of the discrete residual, in
+single precision for the steps of Newton's method, where unknowns that follow are held.
 """
 
 from typing import NamedTuple
@@ -16,9 +15,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from ..mechanics.arm_balance import rounding_of, state_of as arm_state_of
-from ..mechanics.balance import ALL, residual, tangent, without_force
+from ..mechanics.balance import ALL, residual, without_force
 from ..mechanics.coupling import ArmProblem, ArmState, borders_of
-from ..mechanics.reaction import reaction_change, slopes_of
 from ..numerics import component as c, lu
 from ..numerics.batching import arms_in, iterated, side_by_side
 from ..numerics.component import Vector
@@ -27,7 +25,7 @@ from ..numerics.damped_rules import Damped, Measures
 from ..numerics.implicit import implicit_root
 from ..numerics.newton import Root
 from ..numerics.quadrature import Grid
-from ..numerics.stacked import components, stack
+from ..numerics.stacked import components
 
 _ASYMMETRIC = 0.2
 """Asymmetry of two coordinates of the tangent, as a fraction of their elastic stiffness, above
@@ -125,36 +123,37 @@ def imbalance(
     unknown: GalerkinUnknown, at: ArmState, basis: NodalBasis, problem: ArmProblem
 ) -> GalerkinUnknown:
     """Residual: generalised force, and the rows of the couplings with unknowns."""
-    wrench = None if at.along is None else components(at.along.wrench)
-    r = residual(at.xi, problem.sections, at.tau, wrench)
     rows = tuple(
         None if x is None else coupling.residual(x, at, note, problem, ALL)
         for coupling, x, note in zip(problem.couplings, unknown.coupled, at.notes, strict=True)
     )
-    force, idle = _projected(basis.matrix, r, problem.grid), _idle(basis, problem)
+    force = _projected(basis.matrix, _wrench(at, problem), problem.grid)
+    idle = _idle(basis, problem)
     return GalerkinUnknown(force if idle is None else force + idle * unknown.q, rows)
+
+
+def _wrench(at: ArmState, problem: ArmProblem) -> Vector:
+    """Residual of the cross-sections."""
+    wrench = None if at.along is None else components(at.along.wrench)
+    return residual(at.xi, problem.sections, at.tau, wrench)
 
 
 def approximate_tangent(
     unknown: GalerkinUnknown, at: ArmState, basis: NodalBasis, problem: ArmProblem
 ) -> Array:
-    """Derivative of the residual without that of the unknowns that follow from the coordinates, to
-    the order of the quadrature and in single precision."""
+    """Derivative of the residual without that of the unknowns that follow from the coordinates, in
+    single precision."""
     unknown, at, basis, problem = c.single((unknown, at, basis, problem))
-    sections, grid, matrix = problem.sections, problem.grid, basis.matrix
-    columns = tuple(
-        matrix[:, :, i] for i in range(6)
-    )  # with the coordinates in an axis behind those of the nodes
-    behind = grid.h.ndim - 1
+    grid, matrix, behind = problem.grid, basis.matrix, problem.grid.h.ndim - 1
+    coupled = coupled_of(unknown, basis, problem)
 
-    def beside(tree: c.Tree) -> c.Tree:
-        return jax.tree.map(lambda x: jnp.expand_dims(x, x.ndim - behind), tree)
+    def wrench(xi: Vector) -> Vector:
+        return _wrench(arm_state_of(xi, coupled, problem), problem)
 
-    change = c.matvec(c.symmetric(beside(tangent(at.xi, sections, at.tau))), columns)
-    if at.along is not None and at.loads is not None:
-        slopes = slopes_of(at.along, at.loads)
-        moved = reaction_change(stack(columns), *beside((at.along, slopes, grid)))
-        change = c.subtract(change, components(moved))
+    _, change_of = jax.linearize(wrench, at.xi)
+    shape = (*at.xi[0].shape[:2], matrix.shape[3], *at.xi[0].shape[2:])
+    columns = tuple(jnp.broadcast_to(matrix[:, :, i], shape) for i in range(6))
+    change = jax.vmap(change_of, 2, 2)(columns)
     K = _regular(_gathered(matrix, change, grid), _idle(basis, problem))
     _, border = borders_of(problem, unknown.coupled, at)
     if border is None:

@@ -10,6 +10,7 @@ so that any number of operators can be batched.
 """
 
 from abc import abstractmethod
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -45,8 +46,9 @@ class Operator(eqx.Module):
         """Any array of the shape and dtype of the vectors."""
 
     @abstractmethod
-    def times(self, v: Array) -> Array:
-        """$S v$, in the allowed space; zero for vectors orthogonal to it."""
+    def product(self) -> Callable[[Array], Array]:
+        """The function $v \\mapsto S v$, in the allowed space; zero for vectors orthogonal to it.
+        What does not depend on v is computed once."""
 
     @abstractmethod
     def allowed(self, v: Array) -> Array:
@@ -85,6 +87,7 @@ def extreme_pairs(operator: Operator) -> Pairs:
     $(S - \lambda)\, dv = -(dS - d\lambda) v$ by conjugate gradients. A multiple eigenvalue has no
     derivative; the result is the derivative along one of its eigenvectors.
     """
+    product = operator.product()
     start = np.random.default_rng(0).standard_normal(operator.like.shape)
     start = operator.allowed(jnp.asarray(start, operator.like.dtype))
     eps = float(jnp.finfo(start.dtype).eps)
@@ -99,7 +102,7 @@ def extreme_pairs(operator: Operator) -> Pairs:
 
     def extend(basis: _KrylovBasis) -> _KrylovBasis:
         return _with_ritz(
-            lax.fori_loop(0, _BETWEEN, lambda _, basis: _one_more(operator, basis), basis)
+            lax.fori_loop(0, _BETWEEN, lambda _, basis: _one_more(operator, product, basis), basis)
         )
 
     basis = lax.while_loop(proceed, extend, _empty(start))
@@ -128,12 +131,12 @@ def _empty(start: Array) -> _KrylovBasis:
     )
 
 
-def _one_more(operator: Operator, basis: _KrylovBasis) -> _KrylovBasis:
+def _one_more(operator: Operator, product: Callable, basis: _KrylovBasis) -> _KrylovBasis:
     """Add one vector. Once the basis spans an invariant space, further vectors are zero and T is
     padded with an entry from inside its spectrum."""
     v, j = basis.following, basis.filled
     rows = basis.rows.at[j].set(v)
-    w = operator.times(v.reshape(operator.like.shape)).reshape(-1)
+    w = product(v.reshape(operator.like.shape)).reshape(-1)
     parts = rows @ w
     w = operator.allowed((w - parts @ rows).reshape(operator.like.shape)).reshape(
         -1
@@ -236,8 +239,9 @@ def _solve(operator: Operator, value: Array, v: Array, sign: float, right: Array
 
     def definite(x: Array) -> Array:
         inside = project(x)
-        return sign * project(operator.times(inside) - value * inside) + x - inside
+        return sign * project(product(inside) - value * inside) + x - inside
 
+    product = operator.product()
     eps, right = float(jnp.finfo(right.dtype).eps), sign * project(right)
     x, _ = cg(definite, right, tol=eps**0.8, maxiter=1000)
     left = definite(x) - right
@@ -252,7 +256,7 @@ def _extreme_pairs_jvp(primals: tuple, tangents: tuple) -> tuple[Pairs, Pairs]:
     values, vectors = [], []
     for value, v, sign in zip(pairs.values, pairs.vectors, (1.0, -1.0), strict=True):
         product, moved = change_of(
-            lambda operator, v=v: (operator.times(v), operator.allowed(v)), primals, tangents
+            lambda operator, v=v: (operator.product()(v), operator.allowed(v)), primals, tangents
         )
         values.append(jnp.sum(v * product))
         vectors.append(moved - _solve(operator, value, v, sign, product))

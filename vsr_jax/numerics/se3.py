@@ -85,6 +85,14 @@ def stacked_rotation(k: Array) -> Array:
     return _rotation(k, 1.0 - b * square, a, b)
 
 
+def stacked_turn(k: Array, change: Array) -> Array:
+    r"""Rotation $\epsilon$ in the body frame by a change of a rotation vector (3, ...),
+    $\tilde\epsilon = R^T \delta R$ for $R = \exp \tilde k$."""
+    _, b, c3 = (once(x) for x in exp_coefficients(stacked.dot(k, k)))
+    across = cross(k, change)
+    return change + c3 * cross(k, across) - b * across
+
+
 def stacked_exp(omega: Array) -> Array:
     """`exp` of a twist (6, ...): rotation and translation, shape (3, 4, ...)."""
     k, u = rows(omega, 0, 3), rows(omega, 3, 6)

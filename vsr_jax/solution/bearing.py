@@ -1,26 +1,16 @@
-"""What holds an arm and what it touches: support reactions, contacts, and the tangent of an arm
-that they constrain."""
+"""What holds an arm and what it touches: support reactions and contacts."""
 
 from typing import NamedTuple
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from ..arm.scene import CrossSections
-from ..mechanics.arm_balance import ArmUnknown, imbalance_of, state_of
-from ..mechanics.balance import ALL, free_components, spread
-from ..mechanics.contact import Contacts
+from ..mechanics.arm_balance import ArmUnknown, state_of
 from ..mechanics.coupling import ArmProblem
 from ..mechanics.held import Holds
 from ..mechanics.nearest import lying
 from ..mechanics.touch import Surroundings, Touch, received
-from ..numerics import lu
-from ..numerics.component import Vector
-from ..numerics.lanczos import Operator
 from ..numerics.quadrature import Grid
 from ..typing import DTypeLike
 
@@ -113,124 +103,3 @@ def _at_ends(touch: Touch, second: np.ndarray, there: Array) -> Array:
     end = jnp.where(there, touch.force[second], 0.0) + jnp.where(at_end, near, 0.0)
     end += received(-at_start.astype(near.dtype), near)
     return jnp.stack([jnp.where(at_end | at_start, 0.0, near), end], -1)
-
-
-class Supported(eqx.Module):
-    """An arm with what holds it and what it touches; `units` scales changes of the free strains,
-    and `ties` are the scaled changes that held sections, contacts and taut cables prevent: rows C,
-    and `share`, $(C C^T)^{-1} C$."""
-
-    problem: ArmProblem
-    unknown: ArmUnknown
-    units: Float[Array, "strains stages steps"]
-    ties: Float[Array, "ties changes"]
-    share: Float[Array, "ties changes"]
-    free: tuple[int, ...] = eqx.field(static=True)
-
-    def tangent(self) -> "SupportedTangent":
-        """The scaled tangent as an operator."""
-        return SupportedTangent(self)
-
-    def form(self, v: Array) -> Array:
-        """$v^T S v$ with S the scaled tangent."""
-        x = self.allowed(v)
-        return jnp.sum(x * self.times(x))
-
-    def times(self, v: Array) -> Array:
-        """The scaled tangent, where the wrenches of supports and contacts keep their sizes."""
-        weight = self.problem.grid.weight
-
-        def imbalance(v: Array) -> Array:
-            change = spread(tuple(self.units * v), self.free)
-            xi = tuple(x + y for x, y in zip(self.unknown.xi, change, strict=True))
-            unknown = self.unknown._replace(xi=xi)
-            at = state_of(xi, unknown.coupled, self.problem)
-            return jnp.stack(imbalance_of(unknown, at, self.problem, self.free).wrench)
-
-        return weight * self.units * jax.jvp(imbalance, (jnp.zeros_like(v),), (v,))[1]
-
-    def allowed(self, v: Array) -> Array:
-        """Orthogonal projection onto the changes that nothing prevents."""
-        v = jnp.where(self.units > 0, v, 0.0)
-        return v - (self.ties.T @ (self.share @ v.reshape(-1))).reshape(v.shape)
-
-
-class SupportedTangent(Operator):
-    """Symmetric part of the scaled tangent of a `Supported` arm."""
-
-    arm: Supported
-
-    @property
-    def like(self) -> Array:
-        return self.arm.units
-
-    def allowed(self, v: Array) -> Array:
-        return self.arm.allowed(v)
-
-    def times(self, v: Array) -> Array:
-        back = jax.linear_transpose(self.arm.times, self.like)
-        v = self.allowed(v)
-        return self.allowed(0.5 * (self.arm.times(v) + back(v)[0]))
-
-
-def units_of(
-    sections: CrossSections, grid: Grid, free: tuple[int, ...]
-) -> Float[Array, "strains stages steps"]:
-    r"""Units of changes of the free strains, $\Sigma^{-1/2} W^{-1/2}$ with W the weights of the
-    nodes; zero on rigid pieces and at nodes of zero weight, where nothing changes."""
-    stiffness = jnp.stack(
-        [jnp.broadcast_to(s, grid.X.shape) for s in free_components(sections.stiffness, free)]
-    )
-    there = grid.weight > 0
-    if sections.flexible is not None:
-        there &= sections.flexible > 0
-    return jnp.where(there, 1 / jnp.sqrt(jnp.where(there, grid.weight, 1.0) * stiffness), 0.0)
-
-
-def supported(problem: ArmProblem, unknown: ArmUnknown, free: tuple[int, ...]) -> Supported:
-    """The arm of a solution with what holds it."""
-    units = units_of(problem.sections, problem.grid, ALL)
-    at = state_of(unknown.xi, unknown.coupled, problem)
-    ties = []
-    for coupling, x, note in zip(problem.couplings, unknown.coupled, at.notes, strict=True):
-        if isinstance(coupling, Contacts):
-            points = coupling.points(x, at, note, problem)
-            # friction, of the points behind, does not hold an arm
-            rows = coupling.rows(at, note, problem.grid)
-            corner = points.corner[: coupling.per_step].reshape(-1)
-        else:
-            border = coupling.border(x, at, note, problem)
-            if border is None:
-                continue
-            rows, corner = border.rows, border.corner
-        ties.append(_ties(rows, corner < _HOLDING, problem.grid.weight * units, free))
-    tied = jnp.concatenate(ties)
-    return Supported(problem, unknown, units[np.asarray(free)], tied, _shares(tied), free)
-
-
-def _ties(
-    rows: Vector, holds: Bool[Array, " ties"], scale: Array, free: tuple[int, ...]
-) -> Float[Array, "ties changes"]:
-    """Unit rows over the scaled changes of the free strains, zero for rows that do not hold the
-    arm: also where the free strains have no more than rounding of what all six have, as in the turn
-    about its axis of a straight arm without torsion."""
-    every = jnp.stack(rows, axis=1) * scale
-    row = every[:, np.asarray(free)].reshape(len(every), -1)
-    size, whole = (
-        jnp.linalg.norm(lax.stop_gradient(x).reshape(len(x), -1), axis=1) for x in (row, every)
-    )
-    holds &= size > jnp.sqrt(jnp.finfo(size.dtype).eps) * whole
-    return jnp.where(holds, 1 / jnp.where(holds, size, 1.0), 0.0)[:, None] * row
-
-
-_HOLDING = 0.5
-"""Entry in the corner of a tangent system below which its row holds the arm: 1 where it does
-not."""
-
-
-def _shares(ties: Array) -> Array:
-    """The matrix $(C C^T)^{-1} C$ of rows C, some of them zero, some nearly the same."""
-    gram, eps = ties @ ties.T, jnp.finfo(ties.dtype).eps
-    gram = gram + jnp.diag(jnp.where(jnp.any(ties != 0, axis=1), 16 * eps, 1.0))
-    factors = lu.factor(gram)
-    return jax.vmap(lambda b: lu.substitute(factors, b), 1, 1)(ties)

@@ -20,7 +20,7 @@ from ..numerics.compiling import program
 from ..numerics.component import Vector
 from ..typing import Pose, Scalar, VectorLike
 from ..validation import is_traced, on_arm
-from .bearing import Contact, contacts_of, no_contact, supported, supports_of
+from .bearing import Contact, contacts_of, no_contact, supports_of
 from .energy import Energy, energy_of
 from .estimate import Error, error_of
 from .quantities import (
@@ -308,7 +308,7 @@ class Equilibrium(Solved):
 
     def _extreme(self, *, greatest: bool) -> Scalar:
         if self.scene.held or self.scene.obstacles:
-            return extreme_supported(supported(*self._balance, self.scene.free), greatest=greatest)
+            return extreme_supported(*self._balance, self.scene.free, greatest=greatest)
         return extreme(self.scene, self.sound_forces, self.nodes, greatest=greatest)
 
     def _ends(self, index: int) -> tuple[Any, Any]:
