@@ -12,7 +12,7 @@ import vsr_jax as vsr
 from benchmarks.false_failures import search
 from benchmarks.load_steps import Arm
 from benchmarks.ordinary_scenes import STRUCTURES, built
-from vsr_jax.mechanics import elimination_nodes
+from vsr_jax.chain import definiteness
 from vsr_jax.numerics import compiling
 
 GREENHILL = 7.8373
@@ -115,6 +115,6 @@ def test_two_unstable_motions_that_the_pivots_miss_are_found(monkeypatch):
 
     assert real_margin() > 0
     with monkeypatch.context() as blind:
-        blind.setattr(elimination_nodes, "_ASYMMETRIC", np.inf)
+        blind.setattr(definiteness, "_ASYMMETRIC", np.inf)
         assert real_margin() < -0.5
     compiling.drop_programs()

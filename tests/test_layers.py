@@ -13,6 +13,7 @@ import vsr_jax as vsr
 FOLDER = pathlib.Path(vsr.__file__).parent
 PACKAGES = (
     "numerics",
+    "chain",
     "arm",
     "mechanics",
     "models",

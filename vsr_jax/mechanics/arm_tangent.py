@@ -2,6 +2,7 @@
 elimination, and exactly by iterative refinement."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -10,24 +11,21 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
+from ..chain import Border, Chain, Coupled, Definiteness, bordered_solve, with_spans
+from ..chain.spans import Solve, solve_both
 from ..numerics import component as c
-from ..numerics.component import Matrix, Vector
+from ..numerics.component import Vector
 from ..numerics.once import once
 from ..numerics.quadrature import Grid
 from ..typing import cast
 from .arm_balance import ArmImbalance, ArmUnknown
 from .balance import free_components, spread, tangent
-from .border import Border, bordered_solve
 from .coupling import ArmProblem, ArmState, borders_of, points_of
-from .elimination import eliminate
-from .elimination_nodes import Definiteness
 from .loading import Loading
 from .point_forces import PointForces
-from .pose_elimination import eliminate_poses, motions
-from .reaction import Reaction, Slopes, slopes_of
+from .reaction import Reaction, coupled_by
 from .sizes import node_weight
 from .sliding import sliding_of
-from .springs import Solve, solve_both, with_springs
 
 _REFINEMENTS = 60
 """Bound on the refinement steps of a tangent system; 5 to 10 are usual."""
@@ -51,7 +49,7 @@ def approximate_solve(
     symmetric: bool = False,
     apart: bool = False,
 ) -> tuple[ArmUnknown, Array, Array]:
-    """Approximate solution of the tangent system (see `elimination`; a coupling without a border
+    """Approximate solution of the tangent system (see `chain`; a coupling without a border
     has the tangent 1), whether it is definite for the changes of shape that the couplings allow,
     and whether that is doubtful.
 
@@ -83,69 +81,38 @@ def approximate_solve(
     if symmetric:
         points = {place: one._replace(wrench=one.direction) for place, one in points.items()}
     pushes = [one.pushes(right.coupled[place]) for place, one in points.items()]
-    slopes = None if along is None or loads is None else _slopes(along, loads, points)
-    solve = _elimination(lower, along, slopes, grid, free, flexible, apart=apart)
+    coupled = None if along is None or loads is None else _coupled(along, loads, points, grid)
+    chain = Chain(lower, free, flexible, coupled, grid)
+    solve: Solve = partial(chain.solve, apart=apart)
     if along is not None and loads is not None and along.pull is not None:
         chords = along.pull.springs(along.rotation, cut=loads.only_discs)
-        solve = with_springs(solve, chords, grid, loads.conservative, apart=apart)
+        solve = with_spans(solve, chords, grid, loads.conservative, apart=apart)
     b = spread(right.wrench, free)
     if sliding is not None:
         b, more = sliding.driven(b)
         pushes = [push + more for push in pushes]
     borders = borders_of(problem, unknown.coupled, at)
-    strain, coupled, (negative, doubtful) = _bordered(
+    strain, changes, (negative, doubtful) = _bordered(
         solve, b, pushes, right.coupled, borders, grid, loads, apart=apart
     )
     for place, one in points.items():
-        assert along is not None
-        assert slopes is not None
-        assert slopes.part is not None
-        moved = motions(strain, slopes.part, along, grid)
-        coupled[place] = one.change(coupled[place], moved)
+        moved = chain.motions(strain)
+        changes[place] = one.change(changes[place], moved)
         if sliding is not None:
             strain = sliding.followed(strain, moved)
-    return ArmUnknown(strain, tuple(coupled)), negative == 0, doubtful
+    return ArmUnknown(strain, tuple(changes)), negative == 0, doubtful
 
 
-def _slopes(along: Reaction, loads: Loading, points: dict[int, PointForces]) -> Slopes:
-    """Derivatives of the wrenches by motions, with those of the contacts in their cells."""
-    slopes, pull = slopes_of(along, loads), along.pull
-    if pull is not None and loads.only_discs:
-        slopes = slopes._replace(ends=pull.cut_slopes(slopes.motion), joined=pull.joined)
+def _coupled(
+    along: Reaction, loads: Loading, points: dict[int, PointForces], grid: Grid
+) -> Coupled:
+    """How the sections act on each other, with the contacts in their cells."""
+    coupled = coupled_by(along, loads, grid)
     if along.touch is None:
-        return slopes
+        return coupled
     (springs,) = points.values()
     cells, part = springs.slopes(along.touch)
-    return slopes._replace(cells=cells, part=part)
-
-
-def _elimination(
-    lower: Matrix,
-    along: Reaction | None,
-    slopes: Slopes | None,
-    grid: Grid,
-    free: tuple[int, ...],
-    flexible: Array | None,
-    *,
-    apart: bool,
-) -> Solve:
-    """The elimination for several right sides, and what pushes each of them."""
-
-    def one(b: Vector) -> tuple[Vector, Definiteness]:
-        return eliminate(lower, b, along, slopes, grid, free, flexible)
-
-    def solve(b: Vector, *push: Array) -> tuple[Vector, Definiteness]:
-        if along is not None and slopes is not None and slopes.motion == 6:
-            return eliminate_poses(
-                lower, b, along, slopes, grid, free, flexible, *push, apart=apart
-            )
-        if len(b[0]) == 1:
-            found, definiteness = one(tuple(x[0] for x in b))
-            return tuple(x[None] for x in found), definiteness
-        found, definiteness = jax.vmap(one)(b)
-        return jax.tree.map(once, found), jax.tree.map(lambda x: x[0], definiteness)
-
-    return solve
+    return coupled._replace(cells=cells, part=part)
 
 
 def _bordered(

@@ -16,13 +16,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..arm.scene import CrossSections, Scene
+from ..chain.border import Border
 from ..numerics import component as c
 from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import Grid
 from ..numerics.stacked import stack
 from ..typing import Scalar
 from .balance import largest_force_scale, thread_direction, thread_wrench
-from .border import Border
 from .chords import Pull, discs_of
 from .coupling import ArmProblem, ArmState, Coupling
 from .loading import Loading

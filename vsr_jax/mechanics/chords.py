@@ -176,16 +176,6 @@ class Pull(NamedTuple):
         """Stiffness $-\\tau / l$ across each taut chord [N/m], zero across a slack one."""
         return jnp.maximum(-dot(self.force, self.chords.direction), 0.0) / self.chords.length
 
-    def turned(self, theta: Array, shift: Array) -> Array:
-        """Change of the forces (3, chords) by rotations and displacements (3, steps + 1) of the
-        starts of the steps and the tip."""
-        at, e = self.discs.at, self.chords.direction
-        turn, moved = (jnp.sum(at * x[:, None], axis=2) for x in (theta, shift))
-        moved = moved + cross(turn, self.chords.arms)
-        first = self.discs.first
-        change = moved[:, first + 1] - moved[:, first]
-        return -self.stiffness * (change - e * dot(e, change))
-
     def slopes(self, motion: int) -> Array:
         r"""Derivatives (6, motion, steps) of the wrenches at the ends of the steps by the rotations
         there: a force F at a hole q beside the axis has the moment $q \times F$, which changes by

@@ -25,11 +25,11 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from ..arm.scene import CrossSections, Scene
+from ..chain.border import Border, listed
 from ..numerics.component import Forces, Vector
 from ..numerics.damped_rules import HARDENING_STAGES, SOFT_STAGES
 from ..numerics.quadrature import Grid
 from .balance import without_force
-from .border import Border, listed
 from .loading import Loading
 from .point_forces import PointForces
 from .reaction import Reaction

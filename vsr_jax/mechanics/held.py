@@ -27,6 +27,7 @@ from ..arm.held import Held
 from ..arm.pose_loads import Needs, PoseLoad
 from ..arm.rod import Rod
 from ..arm.scene import CrossSections, Scene
+from ..chain.border import Border
 from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import Grid, before_point, beyond, sum_along
 from ..numerics.se3 import base_pose, rotation_vector
@@ -42,7 +43,6 @@ from ..numerics.stacked import (
     turned,
 )
 from ..typing import MatrixLike, Scalar, ScalarLike, VectorLike, real
-from .border import Border
 from .coupling import SOFTENED, ArmProblem, ArmState, Coupling
 from .loading import Loading
 from .pose_terms import PoseTerm, base_of, finite

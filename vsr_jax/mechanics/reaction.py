@@ -20,6 +20,7 @@ from jax import lax
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
 
+from ..chain import Coupled
 from ..numerics.component import Forces, Vector
 from ..numerics.implicit import change_of
 from ..numerics.magnus import magnus_6
@@ -83,39 +84,6 @@ class Reaction(NamedTuple):
     seen: tuple[tuple[Array, Array | None], ...]
     pull: Pull | None
     touch: Touch | None
-
-
-class PointSlope(NamedTuple):
-    """Derivative (6, motion) of a wrench at a point with respect to the motion of its section; the
-    steps and nodes before it as for `FollowerPoint`."""
-
-    step: Array
-    before: Array
-    matrix: Array
-
-
-class Slopes(NamedTuple):
-    """Derivatives of the loads in the world frame with respect to motions of their sections: of the
-    density (6, motion, stages, steps), None if it is constant, of the wrenches at points, of those
-    of chords at the ends of the steps (6, motion, steps), and of what acts in the `cells` of the
-    nodes, about these (6, 6, stages, steps), behind a `part` of each (stages, steps).
-
-    `joined`: 0 for each step at whose end the arm can be cut, since the wrenches on each side
-    depend on the motions of that side relative to the cut; None without cuts."""
-
-    density: Array | None
-    points: tuple[PointSlope, ...]
-    ends: Array | None
-    cells: Array | None = None
-    part: Array | None = None
-    joined: Array | None = None
-
-    @property
-    def motion(self) -> int:
-        """Size of the motions, see `Loading.motion`."""
-        every = (self.density, self.ends, self.cells, *(p.matrix for p in self.points))
-        matrices = [x for x in every if x is not None]
-        return matrices[0].shape[1] if matrices else 0
 
 
 def partial_rotation(k: Array, h: Array, sigma: Array | float) -> Array:
@@ -275,21 +243,30 @@ def _seen(
     return tuple(seen)
 
 
-def slopes_of(along: Reaction, loads: Loading) -> Slopes:
-    """Derivatives of the loads with respect to motions of size `loads.motion`."""
-    size, density, points = loads.motion, None, []
+def coupled_by(along: Reaction, loads: Loading, grid: Grid) -> Coupled:
+    """How the sections act on each other by the loads, without the contacts."""
+    size, density, joined = loads.motion, None, None
+    ends, at_points = None, []
+    if along.pull is not None:
+        cut = loads.only_discs
+        ends = along.pull.cut_slopes(size) if cut else along.pull.slopes(size)
+        joined = along.pull.joined if cut else None
     if along.follower is not None:
         density = _turning(along.follower, size)
     for point, wrench in zip(loads.follower_points, along.points, strict=True):
-        points.append(PointSlope(point.step, point.before, _turning(wrench, size)))
+        at_points.append((point.step, _turning(wrench, size)))
     for term, (turn, place) in zip(loads.by_pose, along.seen, strict=True):
         here = term.slope(turn, place, size)
-        if term.step is not None and term.before is not None:
-            points.append(PointSlope(term.step, term.before, here))
+        if term.step is not None:
+            at_points.append((term.step, here))
         else:
             density = here if density is None else density + here
-    ends = None if along.pull is None else along.pull.slopes(size)
-    return Slopes(density, tuple(points), ends)
+    for step, slope in at_points:  # at the end of the step before each
+        there = jnp.arange(grid.h.shape[0]).reshape(-1, *(1,) * step.ndim) == step - 1
+        here = there.astype(grid.h.dtype) * slope[:, :, None]
+        ends = here if ends is None else ends + here
+    world = along.rotation, along.axis, along.world, along.density
+    return Coupled(*world, density, ends, joined=joined)
 
 
 def _turning(wrench: Array, size: int) -> Array:

@@ -1,5 +1,5 @@
-"""The tangent of an arm with springs between sections far from each other, which the turning chords
-of straight tendons are, from the tangent without them."""
+"""Stiffness across spans: a chain with springs between sections far from each other, which the
+turning chords of straight tendons are, from the chain without them."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -13,16 +13,16 @@ from ..numerics.component import Vector
 from ..numerics.quadrature import Grid
 from ..numerics.stacked import components, stack
 from .border import listed
-from .elimination_nodes import Definiteness
+from .definiteness import Definiteness
 
 Solve = Callable[..., tuple[Vector, Definiteness]]
-"""Solution of a tangent system for several right sides, components (k, stages, steps, ...)."""
+"""Solution of a system for several right sides, components (k, stages, steps, ...)."""
 
 
-def with_springs(
+def with_spans(
     solve: Solve, springs: Vector, grid: Grid, conservative: Array | bool, *, apart: bool
 ) -> Solve:
-    r"""From the `solve` of a tangent A that of $A + \sum_j w_j w_j^T$ (Woodbury's formula).
+    r"""From the `solve` of a matrix A that of $A + \sum_j w_j w_j^T$ (Woodbury's formula).
 
     Its number of negative eigenvalues is that of A, less the number of negative pivots of
     $1 + W^T A^{-1} W$.

@@ -1,4 +1,5 @@
-r"""The tangent of the balance of all cross-sections, solved by block elimination along the arm.
+r"""Passes along a chain whose sections act on each other by their turns alone: its product, and its
+solution by block elimination.
 
 In the world frame a change of strain $(\kappa, \upsilon)$ rotates the sections beyond it, $\theta'
 = \kappa$, and changes the reaction at a node. With $(m, n)$ the wrench at the node, $(\delta m,
@@ -9,9 +10,9 @@ $$H \, \delta\xi = (\delta m - \theta \times m, \ \delta n - \theta \times n) + 
 -\delta n' = F \theta,$$
 
 where C and F are the derivatives of the load densities by the rotation. Loads that depend on
-positions are the matter of `pose_elimination`. The integrals over a step are those of the residual,
-exact for polynomials through its nodes (Gauss collocation), so that the tangent differs from the
-exact one only by the derivative of the rotations within a step, of the order of the steps.
+positions are the matter of `hinges`. The integrals over a step are those of the residual, exact for
+polynomials through its nodes (Gauss collocation), so that the matrix differs from the derivative of
+the residual only by that of the rotations within a step, of the order of the steps.
 
 The linear strains are eliminated at each node. The balance of the nodes of a step, a system of 3 x
 3 blocks, then gives their bending by the rotation at the start of the step, the wrench at its end
@@ -21,8 +22,8 @@ to the tip gives the rotations. Matrices and the vectors that depend on b are ke
 the derivative by b and its transpose are small programs.
 
 In a batch of arms each node is a step of its own, whose length is its weight (the midpoint rule).
-That tangent is off by some percent, but a solve takes only one or two steps more, each with half
-the memory traffic, which is what bounds a batch.
+That matrix is off by some percent, but a solve takes only one or two steps more, each with half the
+memory traffic, which is what bounds a batch.
 """
 
 from functools import partial
@@ -32,69 +33,72 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from ..numerics import component as c, stacked
-from ..numerics.component import Matrix, Tree, Vector
+from ..numerics import component as c
+from ..numerics.component import Matrix, Tree
 from ..numerics.once import once
-from ..numerics.quadrature import Grid
-from ..numerics.stacked import matvec, rows, transpose, turned
-from .balance import free_block, free_components, spread
-from .elimination_nodes import (
-    UNSTABLE_SECTION,
-    Definiteness,
-    at_last_nodes,
-    at_node,
-    block_of,
-    definiteness,
-    jumps,
-    places_of,
-    whole,
-)
-from .elimination_step import Joint, Link, StepNodes, by_start, condensed, join
-from .reaction import Reaction, Slopes
+from ..numerics.quadrature import Grid, collocation, gauss_legendre, remaining, weighted
+from ..numerics.stacked import cross, matvec, rows
+from .coupled import Coupled
+from .nodes import at_last_nodes, at_node, block_of, by_place, places_of, whole
+from .steps import Joint, Link, StepNodes, by_start, condensed, join
 
 
-def eliminate(
-    lower: Matrix,
-    right: Vector,
-    along: Reaction | None,
-    slopes: Slopes | None,
-    grid: Grid,
-    free: tuple[int, ...],
-    flexible: Array | None = None,
-) -> tuple[Vector, Definiteness]:
-    r"""Solution of the tangent system with the right side $b$ for the free strains, and the
-    `Definiteness` of the tangent.
-
-    **Arguments:** node arrays of shape (stages, steps, *arms).
-    - `lower`: lower triangle of $H$.
-    - `right`: $b$, six components.
-    - `along`, `slopes`: the reaction where the tangent is taken, and the derivatives of the loads.
-      Without loads only $H$ is solved, node by node.
-    - `free`: the strains that are not locked.
-    - `flexible`: 0 on rigid pieces and 1 elsewhere, None without rigid pieces.
-
-    **Returns:** six components, zero for the locked strains and on rigid pieces; meaningless where
-    the tangent is not definite.
-    """
-    if along is None or slopes is None or min(free) > 2:
-        right = c.times(flexible, right)
-        x = c.cholesky_solve(c.cholesky(free_block(lower, free)), free_components(right, free))
-        unstable = jnp.any(jnp.isnan(x[-1]), axis=(0, 1))
-        negative = jnp.where(unstable, UNSTABLE_SECTION, 0).astype(jnp.int32)
-        return spread(x, free), Definiteness(negative, jnp.zeros_like(unstable))
-    nodes = _nodes(c.symmetric(lower), right, along, slopes, grid, flexible)
-    arms, size = nodes.axis.shape[3:], 6 if slopes.motion else 3
-    nothing = jnp.zeros((size, 3, *arms), nodes.axis.dtype)
-    end, last = (nothing, nothing[:, 0]), -1 - len(arms)  # the axis of the steps
+def solved_by_steps(
+    nodes: StepNodes, grid: Grid, free: tuple[int, ...]
+) -> tuple[Array, Array, Array, Array]:
+    """The strain in the world's axes, (6, stages, steps, *arms), and for each step the number of
+    negative pivots, whether its sections are stable by themselves, and the asymmetry."""
+    arms = nodes.axis.ndim - 3
+    turning = nodes.slope is not None or nodes.jump is not None
+    nothing = jnp.zeros((6 if turning else 3, 3, *nodes.axis.shape[3:]), nodes.axis.dtype)
     passed = _node_by_node if arms else _step_by_step
-    (by_theta, constant), theta, signs = passed(nodes, end, grid, free)
-    found = matvec(by_theta, jnp.moveaxis(theta, 0, last)[:, None]) + constant
-    if arms:
-        found = found.reshape(6, *grid.X.shape[1::-1], *arms).swapaxes(1, 2)
-    found = turned(transpose(nodes.rotation), found)
-    # turning a strain into the world frame and back leaves rounding in those that are locked
-    strain = spread(free_components(stacked.components(found), free), free)
-    return strain, definiteness(*signs, grid)
+    (by_theta, constant), theta, signs = passed(nodes, (nothing, nothing[:, 0]), grid, free)
+    found = matvec(by_theta, jnp.moveaxis(theta, 0, -1 - arms)[:, None]) + constant
+    return by_place(found[:, 0], grid, arms) if arms else found, *signs
+
+
+def changes_by_steps(nodes: StepNodes, strain: Array, grid: Grid) -> Array:
+    r"""What a change of strain in the world's axes does to the wrenches on the sections,
+    $(\delta m - \theta \times m, \ \delta n - \theta \times n)$, both (6, stages, steps, *arms)."""
+    arms, last = nodes.axis.ndim - 3, 2 - nodes.axis.ndim
+    places = places_of(grid) if arms else (jnp.arange(len(grid.h)),)
+    nodes = _apart(nodes, grid) if arms else nodes
+
+    def own(place: tuple[Array, ...]) -> tuple[StepNodes, Array]:
+        node, change = at_node((nodes, strain), place, arms)
+        return (_alone(node, last), jnp.expand_dims(change, last)) if arms else (node, change)
+
+    def forward(theta: Array, place: tuple[Array, ...]) -> tuple[Array, tuple[Array, Array]]:
+        node, change = own(place)
+        kappa, h, stages = rows(change, 0, 3), node.h, change.shape[1]
+        turns = theta[:, None] + h * weighted(collocation(stages), kappa, 1)
+        end = theta + h * weighted(gauss_legendre(stages)[1], kappa, 1)
+        return c.times(node.joined, end), (turns, end)
+
+    def backward(beyond: Array, step: tuple) -> tuple[Array, Array]:
+        (turns, end), place = step
+        node, change = own(place)
+        beyond = c.times(node.joined, beyond)
+        if node.jump is not None:
+            beyond = beyond + matvec(node.jump, end)
+        moment, force = (rows(beyond, i, i + 3)[:, None] for i in (0, 3))
+        m, n = rows(node.wrench, 0, 3), rows(node.wrench, 3, 6)
+        density = jnp.zeros_like(change)
+        if node.slope is not None:
+            density = matvec(node.slope, turns)
+        rest = remaining(change.shape[1])
+        forces = force + node.h * weighted(rest, rows(density, 3, 6), 1)
+        shift = cross(turns, node.axis) + rows(change, 3, 6)
+        lever = cross(shift, n) + cross(node.axis, forces[:, :-1])
+        moments = moment + node.h * weighted(rest, lever + rows(density, 0, 3), 1)
+        wrench = moments[:, :-1] - cross(turns, m), forces[:, :-1] - cross(turns, n)
+        return jnp.concatenate([moments[:, -1], forces[:, -1]]), jnp.concatenate(wrench)
+
+    none = jnp.zeros_like(strain[:, 0, 0])
+    _, turns = lax.scan(forward, none[:3], places)
+    _, found = lax.scan(backward, none, (turns, places), reverse=True)
+    found = jnp.moveaxis(found, 0, -1 - arms)
+    return by_place(found[:, 0], grid, arms) if arms else found
 
 
 def _step_by_step(
@@ -163,32 +167,32 @@ def _rotations(turn: Array, more: Array, joined: Array | None) -> Array:
     return lax.scan(forward, none, (turn, more, joined))[1]
 
 
-def _nodes(
-    H: Matrix,
-    right: Vector,
-    along: Reaction,
-    slopes: Slopes,
-    grid: Grid,
-    flexible: Array | None,
+def step_nodes(
+    H: Matrix, right: Array, coupled: Coupled, grid: Grid, flexible: Array | None
 ) -> StepNodes:
-    """The nodes of all steps, in the last axes (stages, steps, *arms)."""
-    stacks = along.world.shape[1:], along.axis.shape[1:]
-    shape = jnp.broadcast_shapes(*(x.shape for x in (*H[0], *right, grid.weight)), *stacks)
-    jump, all_of = jumps(slopes, grid), partial(whole, shape=shape)
+    """The nodes of all steps, in the last axes (stages, steps, *arms), with a right side b (6,
+    stages, steps, *arms) in their axes."""
+    shape = right.shape[1:]
+    all_of = partial(whole, shape=shape)
+
+    def at_ends(x: Array | None) -> Array | None:
+        lead = 0 if x is None else x.ndim - len(shape) + 1
+        return None if x is None else jnp.broadcast_to(x, (*x.shape[:lead], *shape[1:]))
+
     return StepNodes(
         jnp.broadcast_to(grid.h, shape[1:]),
-        all_of(along.rotation),
+        all_of(coupled.rotation),
         block_of(H, 0, 0, shape),
         block_of(H, 0, 3, shape),
         block_of(H, 3, 3, shape),
-        jnp.stack([all_of(x) for x in right]),
-        all_of(along.axis),
-        all_of(along.world),
-        all_of(along.density),
-        None if slopes.density is None else all_of(slopes.density),
-        None if jump is None else jnp.broadcast_to(jump, (*jump.shape[:2], *shape[1:])),
+        right,
+        all_of(coupled.axis),
+        all_of(coupled.wrench),
+        all_of(coupled.wrench_density),
+        None if coupled.density is None else all_of(coupled.density),
+        at_ends(coupled.ends),
         None if flexible is None else all_of(flexible),
-        None if slopes.joined is None else jnp.broadcast_to(slopes.joined, shape[1:]),
+        at_ends(coupled.joined),
     )
 
 

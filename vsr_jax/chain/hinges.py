@@ -1,5 +1,4 @@
-r"""The hinges of `pose_elimination`: the arm under loads that depend on positions, and the
-elimination of one hinge.
+r"""The hinges of a chain, and the elimination of one of them.
 
 Each node represents a cell of its weight w, integrated by the midpoint rule: the arm is a chain of
 hinges at the nodes, which turn by $w\kappa$ and slide by $w\upsilon$, with stiff links between
@@ -45,8 +44,9 @@ from ..numerics.component import Matrix
 from ..numerics.once import once
 from ..numerics.quadrature import Grid
 from ..numerics.stacked import blocks, columns, cross, matmul, product, rows, skew, transpose
-from .elimination_nodes import at_last_nodes, block_of, inverse_block, jumps, whole
-from .reaction import Reaction, Slopes
+from .coupled import Coupled
+from .definiteness import inverse_block
+from .nodes import at_last_nodes, block_of, whole
 
 
 class Hinge(NamedTuple):
@@ -81,43 +81,44 @@ class Hinge(NamedTuple):
 def hinges_of(
     H: Matrix,
     right: Array,
-    along: Reaction,
-    slopes: Slopes,
+    coupled: Coupled,
     grid: Grid,
-    free: tuple[int, ...],
     flexible: Array | None,
     push: Array | None,
     unknowns: int,
+    *,
+    linear: bool,
 ) -> Hinge:
     """All hinges, in the last axes (stages, steps, *arms).
 
     **Arguments:** `right`, `push`: right sides (6, sides, stages, steps, *arms), `push` in the
-    world frame; `unknowns`: number of columns between those of motions and those of right sides.
+    world's axes; `unknowns`: number of columns between those of motions and those of right sides;
+    `linear`: whether linear strains are free.
     """
     shape, sides = right.shape[2:], right.shape[1]
     all_of = partial(whole, shape=shape)
-    R, w, wrench = all_of(along.rotation), all_of(grid.weight), once(all_of(along.world))
-    reach = once(0.5 * w * all_of(along.axis))  # from the node to the end of its cell
+    R, w, wrench = all_of(coupled.rotation), all_of(grid.weight), once(all_of(coupled.wrench))
+    reach = once(0.5 * w * all_of(coupled.axis))  # from the node to the end of its cell
     link = once(reach + _after(reach, len(shape)))
-    load = _on_links(wrench, reach, link, slopes, grid)
+    load = _on_links(wrench, reach, link, coupled, grid)
     b = once(jnp.concatenate([matmul(R, part) for part in halves(right)]))
     stiff = _seen_from(R, block_of(H, 0, 0, shape))
     even = matmul(skew(reach), skew(rows(wrench, 3, 6)))
     stiff = [once(stiff + 0.25 * w * (even + transpose(even)))]
-    if max(free) > 2:
+    if linear:
         stiff += [_seen_from(R, block_of(H, i, 3, shape)) for i in (0, 3)]
     inside = None
-    if slopes.cells is not None and slopes.part is not None:
-        cells = all_of(slopes.cells)
+    if coupled.cells is not None and coupled.part is not None:
+        cells = all_of(coupled.cells)
         cells = _wider(cells, unknowns + sides) if push is None else _beside(cells, push, unknowns)
-        inside = cells, all_of(slopes.part)
+        inside = cells, all_of(coupled.part)
     load, given = _wider(load, unknowns + sides), _beside(-_half(wrench), b, unknowns)
     lever = _wider(skew(link), 3 + unknowns + sides)
     flexible = None if flexible is None else all_of(flexible)
     return Hinge(w, link, R, lever, tuple(stiff), given, load, flexible, inside)
 
 
-def _on_links(wrench: Array, reach: Array, link: Array, slopes: Slopes, grid: Grid) -> Array:
+def _on_links(wrench: Array, reach: Array, link: Array, coupled: Coupled, grid: Grid) -> Array:
     """Derivatives (6, 6, stages, steps, *arms) of the loads on all links by their motions, about
     the nodes before them.
 
@@ -132,12 +133,11 @@ def _on_links(wrench: Array, reach: Array, link: Array, slopes: Slopes, grid: Gr
     moved = matmul(skew(rows(load, 3, 6)), skew(reach))
     half = _half(load)
     load = blocks(moved - half[:3, :3], half[:3, 3:], -half[3:, :3], half[3:, 3:])
-    jump = jumps(slopes, grid)
-    if jump is not None:
-        jump = jnp.broadcast_to(jump, (*jump.shape[:2], *shape[1:]))
+    if coupled.ends is not None:
+        jump = jnp.broadcast_to(coupled.ends, (*coupled.ends.shape[:2], *shape[1:]))
         load = load + at_last_nodes(_carried(jump, reach[:, -1]), shape[0])
-    if slopes.density is not None:
-        density = 0.5 * whole(grid.weight, shape) * whole(slopes.density, shape)
+    if coupled.density is not None:
+        density = 0.5 * whole(grid.weight, shape) * whole(coupled.density, shape)
         load = load + density + _carried(after(density), link)
     return load
 

@@ -1,4 +1,4 @@
-r"""One step of the elimination along an arm (see `elimination`): its nodes, the step without what
+r"""One step of the elimination along a chain (see `step_passes`): its nodes, the step without what
 lies beyond it, and the step joined with that."""
 
 from typing import NamedTuple
@@ -22,7 +22,7 @@ from ..numerics.stacked import (
     transpose,
     turned,
 )
-from .elimination_nodes import asymmetry_of, inverse_block
+from .definiteness import asymmetry_of, inverse_block
 
 
 class StepNodes(NamedTuple):

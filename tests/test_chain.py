@@ -1,0 +1,223 @@
+"""The matrix of a chain: its solution and the signs of its eigenvalues against the dense matrix, of
+random chains of every kind."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from vsr_jax.chain import Border, Chain, Coupled, bordered_solve, with_spans
+from vsr_jax.numerics.component import cholesky
+from vsr_jax.numerics.quadrature import beyond, make_grid
+
+STAGES, STEPS = 2, 3
+EVERY, BENDING, PLANE, STRETCH = (0, 1, 2, 3, 4, 5), (0, 1, 2), (1, 3), (3,)
+KINDS = {
+    "dead forces": {},
+    "dead forces, bending only": {"free": BENDING},
+    "dead forces, in a plane": {"free": PLANE},
+    "dead forces and a rigid piece": {"rigid": True},
+    "loads that turn": {"motion": 3},
+    "loads that turn on an arm that can be cut": {"motion": 3, "cut": True},
+    "springs along the arm": {"motion": 6},
+    "springs, bending only": {"motion": 6, "free": BENDING},
+    "springs in the cells": {"motion": 6, "cells": True},
+    "springs in the cells and a rigid piece": {"motion": 6, "cells": True, "rigid": True},
+    "nothing is coupled": {"coupled": False},
+    "stretch alone": {"free": STRETCH},
+}
+WITH_POTENTIAL = [
+    (name, pressed)
+    for name in KINDS
+    for pressed in (0.3, 2.0, 6.0)
+    if KINDS[name].get("motion") == 6 or (KINDS[name].get("motion") is None and pressed < 6.0)
+    if name != "nothing is coupled"
+]
+"""Those whose matrix is symmetric, but for errors of the quadrature, and forces that press them.
+Under dead forces the pivots are those of an arm of which no single step buckles."""
+
+
+def by_cells(forces, axis, weight):
+    """Wrenches at the nodes, and their density, by forces on the links behind them."""
+    wrench, after, link = np.zeros((6, *weight.shape)), np.zeros(6), np.zeros(3)
+    for step in reversed(range(weight.shape[1])):
+        for stage in reversed(range(weight.shape[0])):
+            force, reach = forces[:, stage, step], 0.5 * weight[stage, step] * axis[:, stage, step]
+            moment = after[:3] + np.cross(reach + link, after[3:]) + np.cross(reach, force)
+            after, link = np.concatenate([moment, after[3:] + force]), reach
+            wrench[:, stage, step] = after
+    return wrench, np.zeros_like(wrench)
+
+
+def by_steps(forces, axis, grid):
+    """Wrenches at the nodes, and their density, by the forces beyond each."""
+    moving = np.cross(axis, forces, axis=0)
+    wrench = np.concatenate([beyond(jnp.asarray(moving), grid), forces])
+    return wrench, np.concatenate([moving, np.zeros_like(moving)])
+
+
+def chain(
+    seed, *, free=EVERY, coupled=True, motion=0, cells=False, rigid=False, cut=False, pressed=1.0
+):
+    """A chain of random sections under random dead forces of a size `pressed`, and springs where
+    motions have the size 6: all of a potential, but for loads that turn."""
+    rng = np.random.default_rng(seed)
+    grid = make_grid(jnp.array([0.0, 0.5, 1.0]), STEPS, STAGES)
+    shape = grid.X.shape
+    factor = rng.standard_normal((*shape, 6, 6))
+    H = np.moveaxis(factor @ factor.swapaxes(-1, -2) / 6 + np.eye(6), (2, 3), (0, 1))
+    lower = tuple(tuple(jnp.asarray(H[i, j]) for j in range(i + 1)) for i in range(6))
+    flexible = jnp.asarray(np.arange(grid.h.size) != 1, float) * jnp.ones(shape) if rigid else None
+    if not coupled:
+        return Chain(lower, free, flexible, None, grid)
+    rotation = np.linalg.qr(rng.standard_normal((*shape, 3, 3)))[0]
+    rotation *= np.sign(np.linalg.det(rotation))[..., None, None]
+    rotation = np.moveaxis(rotation, (2, 3), (0, 1))
+    axis = np.eye(3)[0].reshape(3, 1, 1) + 0.2 * rng.standard_normal((3, *shape))
+    forces = pressed * rng.standard_normal((3, *shape))
+    if motion == 6:
+        wrenches = by_cells(forces, axis, np.broadcast_to(grid.weight, shape))
+    else:
+        wrenches = by_steps(forces, axis, grid)
+
+    def springs(*shape, size=motion):
+        a = 0.3 * rng.standard_normal((6, size, *shape))
+        return jnp.asarray(a + a.swapaxes(0, 1) if size == 6 else a)
+
+    return Chain(
+        lower,
+        free,
+        flexible,
+        Coupled(
+            *(jnp.asarray(x) for x in (rotation, axis, *wrenches)),
+            springs(*shape) if motion else None,
+            springs(shape[1]) if motion else None,
+            springs(*shape) if cells else None,
+            jnp.asarray(rng.uniform(size=shape)) if cells else None,
+            jnp.asarray(np.arange(shape[1]) != 1, float) if cut else None,
+        ),
+        grid,
+    )
+
+
+def sides(of, count=2, seed=1):
+    rng = np.random.default_rng(seed)
+    shape = (count, *of.grid.X.shape[:2])
+    return tuple(jnp.asarray(rng.standard_normal(shape)) for _ in range(6))
+
+
+def rows(of, vectors):
+    """Vectors (sides, stages, steps) as the rows of the dense matrix have them."""
+    shape = of.grid.X.shape
+    bends = np.ones(shape, bool) if of.flexible is None else np.asarray(of.flexible) > 0
+    return np.concatenate([np.asarray(vectors[i])[:, bends] for i in of.free], axis=1)
+
+
+def weights(of):
+    """Weight of the node of each row."""
+    weight = np.broadcast_to(of.grid.weight, of.grid.X.shape)[None]
+    return rows(of, (weight,) * 6)[0]
+
+
+def stacked(trees):
+    """Chains, or right sides, side by side."""
+    return jax.tree.map(
+        lambda *x: jnp.stack(x, -1) if isinstance(x[0], jax.Array) else x[0], *trees
+    )
+
+
+@pytest.mark.parametrize("apart", [False, True])
+@pytest.mark.parametrize("name", KINDS)
+def test_the_solution_is_that_of_the_dense_matrix(name, apart):
+    of = chain(0, **KINDS[name])
+    b = sides(of)
+    found, _ = jax.jit(lambda b: of.solve(b, apart=apart))(b)
+    expected = np.linalg.solve(np.asarray(of.to_dense()), rows(of, b).T).T
+    np.testing.assert_allclose(rows(of, found), expected, atol=1e-11 * np.abs(expected).max())
+    for i, x in enumerate(found):
+        if i not in of.free:
+            assert np.all(x == 0)
+
+
+@pytest.mark.parametrize("apart", [False, True])
+@pytest.mark.parametrize(("name", "pressed"), WITH_POTENTIAL)
+def test_the_pivots_count_the_negative_eigenvalues(name, apart, pressed):
+    of = chain(2, **KINDS[name], pressed=pressed)
+    dense = weights(of)[:, None] * np.asarray(of.to_dense())
+    if KINDS[name].get("motion") == 6:  # each row with the weight of its node
+        np.testing.assert_allclose(dense, dense.T, atol=1e-13 * np.abs(dense).max())
+    _, definiteness = of.solve(sides(of), apart=apart)
+    values = np.linalg.eigvals(dense)
+    assert int(definiteness.negative) == np.sum((values.real < 0) & (values.imag == 0))
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_the_product_with_the_solution_is_the_right_side(name):
+    """Of chains side by side, whose nodes are steps of their own."""
+    each = [chain(seed, **KINDS[name]) for seed in (3, 4, 5)]
+    both, b = stacked(each), stacked([sides(one) for one in each])
+    found, _ = both.solve(b)
+    for i, (x, y) in enumerate(zip(both.product(found), b, strict=True)):
+        if i in both.free:
+            y = y if both.flexible is None else both.flexible * y
+            np.testing.assert_allclose(x, y, atol=1e-11)
+
+
+def test_chains_side_by_side_are_those_alone():
+    """Where one is solved by the same cells."""
+    each = [chain(seed, **KINDS["springs in the cells"]) for seed in (3, 4, 5)]
+    found, definiteness = stacked(each).solve(stacked([sides(one) for one in each]))
+    for i, one in enumerate(each):
+        expected, alone = one.solve(sides(one))
+        for x, y in zip(found, expected, strict=True):
+            np.testing.assert_allclose(x[..., i], y, atol=1e-11)
+        assert definiteness.negative[i] == alone.negative
+
+
+def test_a_push_in_the_cells_is_a_right_side():
+    """The solution does not change if the push by a spring in a cell is given in place of the
+    spring."""
+    held = chain(6, motion=6, cells=True)
+    loose = held._replace(coupled=held.coupled._replace(cells=jnp.zeros_like(held.coupled.cells)))
+    b = sides(held, 1)
+    strain, _ = held.solve(b)
+    motions = held.motions(tuple(x[0] for x in strain))
+    push = jnp.einsum("abij,bij->aij", held.coupled.cells, motions)
+    again, _ = loose.solve(b, push[None])
+    for x, y in zip(strain, again, strict=True):
+        np.testing.assert_allclose(x, y, atol=1e-12)
+
+
+@pytest.mark.parametrize("apart", [False, True])
+@pytest.mark.parametrize("name", ["dead forces", "springs along the arm"])
+def test_stiffness_across_spans(name, apart):
+    of = chain(7, **KINDS[name])
+    springs, b = sides(of, 4, seed=8), sides(of)
+    solve = lambda b: of.solve(b, apart=apart)  # noqa: E731
+    found, _ = with_spans(solve, springs, of.grid, True, apart=apart)(b)
+    w = rows(of, springs)
+    dense = np.asarray(of.to_dense()) + w.T @ (w * weights(of))
+    expected = np.linalg.solve(dense, rows(of, b).T).T
+    np.testing.assert_allclose(rows(of, found), expected, atol=1e-11 * np.abs(expected).max())
+
+
+def test_a_border():
+    of = chain(9)
+    columns, b, right = sides(of, seed=10), sides(of, 1), jnp.array([0.3, -0.2])
+    border = Border(columns, columns, -jnp.ones(2), jnp.array([0.5, 0.0]))
+    found, answers = of.solve(b)[0], of.solve(columns)[0]
+    strain, x, _ = bordered_solve(tuple(x[0] for x in found), answers, right, border, of.grid)
+    w = rows(of, columns)
+    whole = np.block([[np.asarray(of.to_dense()), w.T], [-w * weights(of), np.diag([0.5, 0.0])]])
+    expected = np.linalg.solve(whole, np.concatenate([rows(of, b)[0], right]))
+    got = np.concatenate([rows(of, tuple(s[None] for s in strain))[0], x])
+    np.testing.assert_allclose(got, expected, atol=1e-11 * np.abs(expected).max())
+
+
+def test_a_section_that_is_unstable_by_itself_is_reported():
+    of = chain(11, coupled=False)
+    less = (0.0, 0.0, 20.0, 0.0, 0.0, 0.0)
+    bad = tuple((*row[:-1], row[-1] - x) for row, x in zip(of.stiffness, less, strict=True))
+    assert np.any(np.isnan(cholesky(bad)[-1]))
+    _, definiteness = of._replace(stiffness=bad).solve(sides(of))
+    assert int(definiteness.negative) > 1000

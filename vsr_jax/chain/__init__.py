@@ -1,0 +1,14 @@
+"""The linear algebra of a chain: the tangent of an arm's balance as a matrix, with its product, its
+solution, the signs of its eigenvalues, stiffness across spans of the chain and a border.
+
+Knows neither rods nor loads: everything here takes stiffnesses, wrenches and derivatives at the
+nodes of a grid.
+"""
+
+from .border import Border, bordered_solve
+from .coupled import Coupled
+from .definiteness import Definiteness
+from .matrix import Chain
+from .spans import with_spans
+
+__all__ = ["Border", "Chain", "Coupled", "Definiteness", "bordered_solve", "with_spans"]
