@@ -17,12 +17,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
 
 from ..chain import Coupled
 from ..numerics.component import Forces, Vector
-from ..numerics.implicit import change_of
+from ..numerics.implicit import change_of, unchanged
 from ..numerics.magnus import magnus_6
 from ..numerics.once import once
 from ..numerics.quadrature import (
@@ -152,7 +151,7 @@ def _rotations_jvp(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
     before = until - of_step
     theta = before, before[:, None] + turn[:, :-1], until[:, -1]
     changes = tuple(matmul(skew(t), x) for t, x in zip(theta, (starts, R, end), strict=True))
-    if base is not None and not isinstance(tangents[2], SymbolicZero):
+    if base is not None and not unchanged(tangents[2]):
         first = matmul(tangents[2][:3, :3], transpose(base[:3, :3]))
         first = first.reshape(3, 3, *first.shape[2:], *(1,) * (end.ndim - first.ndim))
         changes = (

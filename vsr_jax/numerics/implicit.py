@@ -70,6 +70,11 @@ def implicit_root(
     return root(*parameters)
 
 
+def unchanged(tangent: Any) -> bool:
+    """Whether the tangent of a primal is a symbolic zero."""
+    return isinstance(tangent, SymbolicZero)
+
+
 def change_of(function: Callable, primals: tuple, tangents: tuple) -> Any:
     """Derivative of a function along tangents. By primals whose tangent is a symbolic zero it is
     not differentiated.
@@ -86,7 +91,7 @@ def _moving(
     """The function of the primals whose tangent is no symbolic zero, these, and their tangents."""
     leaves, tree = jax.tree.flatten(primals)
     rates = jax.tree.leaves(tangents)
-    moving = [i for i, rate in enumerate(rates) if not isinstance(rate, SymbolicZero)]
+    moving = [i for i, rate in enumerate(rates) if not unchanged(rate)]
 
     def moved(*values: Array) -> Any:
         changed = dict(zip(moving, values, strict=True))
