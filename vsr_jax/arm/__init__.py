@@ -33,6 +33,7 @@ from .routing import Function, Helix, Linear, Parallel, Polynomial, Routing, Spl
 from .scene import CrossSections, Scene
 from .scene_numbers import Parameter, parameters
 from .section import Annular, Circular, Elliptic, Joined, Rectangular, Section
+from .section_law import LinearLaw, SectionLaw
 from .tube import Tube
 
 __all__ = [
@@ -56,6 +57,7 @@ __all__ = [
     "Helix",
     "Joined",
     "Linear",
+    "LinearLaw",
     "Load",
     "MagneticDensity",
     "MagneticMoment",
@@ -77,6 +79,7 @@ __all__ = [
     "Routing",
     "Scene",
     "Section",
+    "SectionLaw",
     "Sphere",
     "Spinning",
     "Spline",

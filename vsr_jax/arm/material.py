@@ -9,6 +9,7 @@ from ..typing import Scalar, ScalarLike
 from .description import Part
 from .profile import Limits, Profile, ProfileLike, as_profile
 from .section import Section
+from .section_law import LinearLaw, SectionLaw
 
 LEAST_POISSON, MOST_POISSON = -1.0, 0.5
 """Range of Poisson's ratio of a stable isotropic material; the lower bound is excluded."""
@@ -83,6 +84,10 @@ class Material(Part):
         angular = (G * shape.torsion, E * shape.moment_y, E * shape.moment_z)
         shear_y, shear_z = (kappa * G * shape.area for kappa in shape.shear_factors)
         return (*angular, E * shape.area, shear_y, shear_z)
+
+    def law(self, section: Section, X: ScalarLike, length: ScalarLike) -> SectionLaw:
+        """The law of a section at X [m], linear; a material of your own may return another."""
+        return LinearLaw()
 
     @property
     def breakpoints(self) -> tuple[Scalar, ...]:

@@ -22,6 +22,7 @@ from .profile import (
 )
 from .rigid_piece import RigidPiece, flexibility
 from .section import Section
+from .section_law import SectionLaw
 
 STRAINS = ("torsion", "bending_y", "bending_z", "elongation", "shear_y", "shear_z")
 """Names of the six strains $(k_x, k_y, k_z, u_x, u_y, u_z)$ in order."""
@@ -104,6 +105,10 @@ class Rod(Part):
     def stiffness(self, X: ScalarLike) -> Vector:
         """Diagonal of $\\Sigma$ at X [m], six scalars [N m^2] and [N]."""
         return self.material.stiffness(self.section, X, self.length)
+
+    def law(self, X: ScalarLike) -> SectionLaw:
+        """Law of the section at X [m]."""
+        return self.material.law(self.section, X, self.length)
 
     def flexible(self, X: ArrayLike) -> Array | None:
         """0 where X [m], of any shape, lies on a rigid piece and 1 elsewhere; None without rigid

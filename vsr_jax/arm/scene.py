@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..numerics.component import Forces, Tree, Vector, Wrench, add
+from ..numerics.component import Forces, Matrix, Tree, Vector, Wrench, add, subtract
 from ..numerics.quadrature import piece_edges
 from ..numerics.stacked import stack
 from ..typing import ArrayLike, DTypeLike, Scalar, ScalarLike, VectorLike, cast, real
@@ -26,18 +26,33 @@ from .rod import STRAINS, Rod
 from .routing import Path
 from .scene_checks import check_held, check_numbers, check_obstacles
 from .scene_numbers import checked_values, replaced
+from .section_law import SectionLaw
 
 
 class CrossSections(NamedTuple):
     r"""Cross-sections at given X: the diagonal of $\Sigma$ (6), $\xi^*$ (6), the `Path` of each
     thread, and its `reach`: 1 between its ends and 0 elsewhere, None if it extends over the whole
-    arm; `flexible`: 0 on rigid pieces and 1 elsewhere, None without rigid pieces."""
+    arm; `flexible`: 0 on rigid pieces and 1 elsewhere, None without rigid pieces; the `law` of the
+    sections, of which $\Sigma$ is the tangent at rest."""
 
     stiffness: Vector
     rest: Vector
     paths: tuple[Path, ...]
     reach: tuple[Array | None, ...]
     flexible: Array | None
+    law: SectionLaw
+
+    def elastic_wrench(self, xi: Vector) -> Vector:
+        """Moment and force by the strain."""
+        return self.law.wrench(subtract(xi, self.rest), self.stiffness)
+
+    def elastic_tangent(self, xi: Vector) -> Matrix:
+        """Lower triangle of the derivative of `elastic_wrench`."""
+        return self.law.tangent(subtract(xi, self.rest), self.stiffness)
+
+    def elastic_energy(self, xi: Vector) -> Array:
+        """Energy per length of the arm [J/m]."""
+        return self.law.energy(subtract(xi, self.rest), self.stiffness)
 
     def carry(self, forces: Forces) -> Forces:
         """Force of each thread here: equal to that at its start between its ends, else zero."""
@@ -228,7 +243,8 @@ class Scene(Part):
             paths = tuple(actuator.routing.path(x) for actuator in self.actuators)
             reach = tuple(actuator.reach(x) for actuator in self.actuators)
             rod = self.rod
-            return CrossSections(rod.stiffness(x), rod.rest(x), paths, reach, rod.flexible(x))
+            stiffness, rest, flexible = rod.stiffness(x), rod.rest(x), rod.flexible(x)
+            return CrossSections(stiffness, rest, paths, reach, flexible, rod.law(x))
 
         return _at_each(at, X)
 

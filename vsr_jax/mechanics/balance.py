@@ -117,21 +117,19 @@ def residual(
 ) -> Vector:
     """Residual of a cross-section (eq. 21): $r = \\Sigma (\\xi - \\xi^*) - B_\\tau \\tau -
     \\Lambda$, zero on rigid pieces."""
-    elastic = multiply(sections.stiffness, subtract(xi, sections.rest))
-    r = subtract(elastic, actuation_wrench(xi, sections, tau))
+    r = subtract(sections.elastic_wrench(xi), actuation_wrench(xi, sections, tau))
     return times(sections.flexible, r if reaction is None else subtract(r, reaction))
 
 
 def tangent(xi: Vector, sections: CrossSections, tau: Forces) -> Matrix:
     """Lower triangle of the tangent stiffness (eq. 12-13): $H = \\Sigma - A$, on rigid pieces
     $\\Sigma$."""
-    zero, tau = jnp.zeros_like(xi[0]), times(sections.flexible, tau)
-    elastic = tuple((*[zero] * i, sections.stiffness[i]) for i in range(6))
+    tau = times(sections.flexible, tau)
 
     def less(lower: Matrix, path: Path, force: Array) -> Matrix:
         return subtract(lower, _thread_stiffness(xi, path, force))
 
-    return over_threads(less, elastic, sections.paths, tau)
+    return over_threads(less, sections.elastic_tangent(xi), sections.paths, tau)
 
 
 def _thread_stiffness(xi: Vector, path: Path, force: Array) -> Matrix:

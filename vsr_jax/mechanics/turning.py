@@ -140,9 +140,9 @@ def residual_rate(
 ) -> Vector:
     """Derivative along the arm of `residual` without its reaction. Not by `jax.jvp`: on a CPU each
     component would compute the directions of all threads and their derivatives again."""
-    off, off_rate = c.subtract(xi, sections.rest), c.subtract(xi_rate, rate.rest)
-    elastic = c.multiply(sections.stiffness, off_rate)
-    elastic = c.add(elastic, c.multiply(rate.stiffness, off))
+    given = (one._replace(paths=(), reach=()) for one in (sections, rate))
+    pairs = zip((xi, xi_rate), given, strict=True)
+    elastic = jax.jvp(lambda xi, at: at.elastic_wrench(xi), *_alike(*pairs))[1]
 
     def less(total: Vector, paths: tuple[Path, Path], forces: tuple[Array, Array]) -> Vector:
         force, force_rate = forces

@@ -57,8 +57,7 @@ def energy_of(
     returns the poses there.
     """
     weight, driven = nodes.grid.weight, scene.length_driven
-    strain = c.subtract(nodes.xi, nodes.sections.rest)
-    elastic = jnp.sum(weight * c.dot(c.multiply(nodes.sections.stiffness, strain), strain)) / 2
+    elastic = jnp.sum(weight * nodes.sections.elastic_energy(nodes.xi))
     tau, zero = nodes.tau(forces), jnp.zeros_like(elastic)
     actuation = cables = zero
     for i, path in enumerate(nodes.sections.paths):
