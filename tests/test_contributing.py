@@ -18,6 +18,7 @@ HEADINGS = [
     "A load",
     "A load that depends on the pose",
     "An obstacle",
+    "A section law",
     "A routing",
     "A basis",
     "A model",

@@ -23,7 +23,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ..arm.scene import Scene
-from ..models.base import Near, Outcome, Status
+from ..models.base import Model, Near, Outcome, Status
 from ..models.strain_dependent import StrainDependent
 from ..numerics.compiling import program
 from ..solution.equilibrium import Equilibrium
@@ -36,7 +36,7 @@ def follow(
     scene: Scene,
     inputs: ArrayLike,
     *,
-    model: StrainDependent | None = None,
+    model: Model | None = None,
     start: Equilibrium | None = None,
 ) -> Equilibrium:
     r"""Equilibria along a path of inputs, in order, with the history of friction, of tendons and of
@@ -75,7 +75,11 @@ def follow(
     """
     instance("scene", scene, Scene, "a Scene")
     model = StrainDependent() if model is None else model
-    instance("model", model, StrainDependent, "a StrainDependent, the only model with a memory")
+    instance("model", model, Model, "a StrainDependent, the only model with a memory")
+    if not model.remembers:
+        raise ValueError(
+            f"model: got {model}, need a StrainDependent, the only model with a memory"
+        )
     values = _path(scene, inputs)
     scene = cast(scene, values.dtype)
     before = model.at_rest(scene, values.dtype) if start is None else _start(start, scene, model)
@@ -93,7 +97,7 @@ def _path(scene: Scene, inputs: ArrayLike) -> Array:
     return values
 
 
-def _start(start: Equilibrium, scene: Scene, model: StrainDependent) -> Near:
+def _start(start: Equilibrium, scene: Scene, model: Model) -> Near:
     near = near_of(scene, start)
     if near.model != model:
         raise ValueError(f"start: got an equilibrium by {near.model}, need one by {model}")
@@ -103,7 +107,6 @@ def _start(start: Equilibrium, scene: Scene, model: StrainDependent) -> Near:
 @program("follow")
 def _follow(scene: Scene, before: Near, inputs: Array) -> Outcome:
     model = before.model
-    assert isinstance(model, StrainDependent)
 
     def proceed(carry: tuple, values: Array) -> tuple[tuple, Outcome]:
         near = Near(model, scene, *carry)
@@ -114,7 +117,5 @@ def _follow(scene: Scene, before: Near, inputs: Array) -> Outcome:
         after = (outcome.forces, outcome.state)
         return jax.tree.map(lambda a, b: jnp.where(found, a, b), after, carry), outcome
 
-    state = before.state
-    if scene.coupled:  # with memories, as all states on the path have them
-        state = state._replace(couplings=model.memory(before))
-    return lax.scan(proceed, (before.forces, state), inputs)[1]
+    start = (before.forces, model.remembered(before).state)
+    return lax.scan(proceed, start, inputs)[1]

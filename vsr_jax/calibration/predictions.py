@@ -11,11 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..arm.rod import STRAIGHT
 from ..arm.scene import Scene
 from ..arm.scene_numbers import parameters, replaced
 from ..models.base import Model, Near, Outcome
-from ..models.strain_dependent import StrainDependent
 from ..numerics import se3
 from ..numerics.compiling import program
 from ..solution.equilibrium import Equilibrium
@@ -102,12 +100,7 @@ class Predictor(eqx.Module):
 
         kind = eqx.filter_eval_shape(jax.vmap(solved), inputs)
         outcome = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), kind)
-        if isinstance(self.model, StrainDependent):
-            straight = tuple(
-                jnp.full_like(x, u) for x, u in zip(outcome.state.xi, STRAIGHT, strict=True)
-            )
-            outcome = outcome._replace(state=outcome.state._replace(xi=straight))
-        return outcome
+        return outcome._replace(state=self.model.straight(outcome.state))
 
     def _changed(self, part: eqx.Module, numbers: Array, prefix: str) -> dict[str, Array]:
         found = {

@@ -113,9 +113,14 @@ class Model(eqx.Module):
     `balanced_everywhere`: whether the balance of the cross-section (eq. 21) holds at every X where
     `strain` is evaluated, to rounding or to the model's tolerances. Derivatives and errors can then
     be taken from the balance instead of from `solve`.
+
+    `begins_near`: whether `solve_from` begins at the solution near by. `remembers`: whether paths
+    of inputs can be followed by `at_rest` and `solve_after`.
     """
 
     balanced_everywhere: ClassVar[bool] = False
+    begins_near: ClassVar[bool] = False
+    remembers: ClassVar[bool] = False
 
     @abstractmethod
     def solve(self, scene: Scene, inputs: Float[Array, " inputs"]) -> Outcome:
@@ -129,6 +134,23 @@ class Model(eqx.Module):
         """As `solve_from`, at a solution of the scene itself, whose derivatives are wanted: a model
         that can does not solve it again."""
         return self.solve_from(scene, inputs, near)
+
+    def solve_after(self, scene: Scene, inputs: Float[Array, " inputs"], near: Near) -> Outcome:
+        """As `solve_from`, on a path of inputs: contacts and tendons with friction remember the
+        solution before, one by this model of the same scene."""
+        raise ValueError(f"model: got {type(self).__name__}, need StrainDependent, with a memory")
+
+    def at_rest(self, scene: Scene, dtype: Any) -> Near:
+        """The arm at rest, from which a path of inputs starts."""
+        raise ValueError(f"model: got {type(self).__name__}, need StrainDependent, with a memory")
+
+    def remembered(self, near: Near) -> Near:
+        """The same solution with a memory of itself, as all states on a path have it."""
+        return near
+
+    def straight(self, state: Any) -> Any:
+        """The state of a straight arm, from one of zeros."""
+        return state
 
     @abstractmethod
     def strain(

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from ..arm.rod import STRAIGHT
 from ..arm.scene import Scene, shared
 from ..mechanics.arm_balance import (
     ArmSolution,
@@ -59,7 +60,7 @@ class StrainDependent(SteppedModel):
 
     steps: int = eqx.field(static=True)
     order: int = eqx.field(static=True)
-    balanced_everywhere = True
+    balanced_everywhere = begins_near = remembers = True
 
     def __init__(self, steps: int = 32, order: int = 6):
         self.steps = count("StrainDependent.steps", steps)
@@ -98,19 +99,22 @@ class StrainDependent(SteppedModel):
         return self._solve_together(scene, problem, solution, solved=True)
 
     def solve_after(self, scene: Scene, inputs: Float[Array, " inputs"], near: Near) -> Outcome:
-        """As `solve_from`, on a path of inputs: the couplings remember the solution before, one by
-        this model of the same scene."""
         if not scene.coupled:
             return self.solve(scene, inputs)
         problem = problem_of(scene, inputs, self.grid(scene))
         couplings = tuple(
             new.remembering(old, problem.grid.X, problem.grid)
-            for new, old in zip(problem.couplings, self.memory(near), strict=True)
+            for new, old in zip(problem.couplings, self._memory(near), strict=True)
         )
         guess = lax.stop_gradient(ArmUnknown(near.state.xi, near.state.coupled))
         return self._solve_together(scene, problem._replace(couplings=couplings), guess)
 
-    def memory(self, near: Near) -> tuple[Coupling, ...]:
+    def remembered(self, near: Near) -> Near:
+        if not near.scene.coupled:
+            return near
+        return near._replace(state=near.state._replace(couplings=self._memory(near)))
+
+    def _memory(self, near: Near) -> tuple[Coupling, ...]:
         """The couplings of a solution by this model, with the memory of it."""
         old, unknown = self.balance(near.scene, near.forces, near.state)
         at = state_of(unknown.xi, unknown.coupled, old)
@@ -120,7 +124,6 @@ class StrainDependent(SteppedModel):
         )
 
     def at_rest(self, scene: Scene, dtype: Any) -> Near:
-        """The arm at rest, from which a path of inputs starts."""
         zero = jnp.zeros(len(scene.actuators), dtype)
         problem = problem_of(scene, zero, self.grid(scene))
         forces = without_force(problem.forces)
@@ -129,6 +132,10 @@ class StrainDependent(SteppedModel):
             return Near(self, scene, forces, ArmSolution(xi, (), ()))
         coupled = tuple(coupling.guess(forces, problem.grid) for coupling in problem.couplings)
         return Near(self, scene, forces, ArmSolution(xi, coupled, problem.couplings))
+
+    def straight(self, state: ArmSolution) -> ArmSolution:
+        xi = (jnp.full_like(x, u) for x, u in zip(state.xi, STRAIGHT, strict=True))
+        return state._replace(xi=tuple(xi))
 
     def _solve_together(
         self,

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..analysis.following import follow
-from ..models.strain_dependent import StrainDependent
 from ..optimization.design_search import Design
 from ..optimization.problem import INPUTS
 from ..solution.equilibrium import Equilibrium
@@ -55,7 +54,7 @@ def path_of(session: Session, slider: Slider) -> Track:
     if slider.of != INPUTS:
         raise ValueError(f"slider: got {slider.name}, need an input for a path with friction")
     model = session.model
-    if not isinstance(model, StrainDependent):
+    if not model.remembers:
         raise ValueError(f"model: got {model}, need a StrainDependent for a path with friction")
     way = np.linspace(slider.low, slider.high, FRAMES)
     inputs = np.tile(session.answer.setting.inputs, (2 * FRAMES, 1))

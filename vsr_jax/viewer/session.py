@@ -218,7 +218,7 @@ class Session:
                 self.compiling("")
 
     def _solved(self, scene: Scene, inputs: np.ndarray) -> Equilibrium:
-        warm = scene.coupled and isinstance(self.model, StrainDependent)
+        warm = scene.coupled and self.model.begins_near
         start = self._start if warm else None
         with self.first("the solve" if start is None else "the solve from a shape near by"):
             eq = solve(scene, self.typed(inputs), model=self.model, start=start)
