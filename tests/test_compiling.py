@@ -187,6 +187,23 @@ def test_the_better_of_two_kept_programs_is_used(monkeypatch, tmp_path, as_insta
     assert seen == [QUICK, {}]
 
 
+def test_a_second_compilation_that_fails_leaves_the_first_one_and_others(monkeypatch, as_installed):
+    def fails(kind):
+        raise RuntimeError("no memory")
+
+    monkeypatch.setattr(compiling, "LONG", -1.0)
+    x, cube = jnp.arange(3.0), made()
+    with monkeypatch.context() as broken:
+        broken.setattr(compiling._Kind, "improve", fails)
+        cube(x)
+        improver_is_done()
+    np.testing.assert_array_equal(cube(x)["cube"], x**3)
+    seen = compiled(monkeypatch)
+    made()(x)
+    improver_is_done()
+    assert seen == [QUICK, {}]
+
+
 def test_one_tier_has_the_defaults_of_the_compiler(monkeypatch, as_installed):
     monkeypatch.setenv("VSR_JAX_TIERS", "off")
     seen = compiled(monkeypatch)

@@ -13,7 +13,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from functools import partial, update_wrapper
 from typing import Any
@@ -192,7 +192,8 @@ class _Improver:
                     self._running = False
                     return
                 kind = self._waiting.popleft()
-            kind.improve()
+            with suppress(Exception):  # the program of the first tier goes on
+                kind.improve()
 
 
 _improver = _Improver()
