@@ -11,6 +11,7 @@ import vsr_jax as vsr
 from vsr_jax.arm.scene_numbers import replaced
 from vsr_jax.mechanics.loading import loading
 from vsr_jax.mechanics.reaction import react
+from vsr_jax.solution.stability import arm_of
 from vsr_jax.studies.timing import primitives
 
 L, R, E = 0.4, 0.01, 1e6
@@ -263,6 +264,23 @@ def test_the_reaction_changes_as_its_derivative_says(everything):
     differences = 8 * (wrench(h) - wrench(-h)) - (wrench(2 * h) - wrench(-2 * h))
     size = np.abs(exact).max()
     assert np.abs(exact - differences / (12 * h)).max() < 1e-9 * size
+
+
+@pytest.mark.slow
+def test_the_form_of_the_tangent_is_its_product(everything):
+    random = np.random.default_rng(1)
+
+    @eqx.filter_jit
+    def form_and_product(eq, free):
+        arm = arm_of(eq.scene, eq.sound_forces, eq.nodes)
+        return arm.form(free / arm.units), jnp.sum(
+            free / arm.units * arm.product()(free / arm.units)
+        )
+
+    sizes = np.array([1, 1, 1, 0.01, 0.01, 0.01]).reshape(6, 1, 1)
+    free = jnp.asarray(sizes * random.normal(size=(6, *everything.nodes.grid.X.shape)))
+    form, product = form_and_product(everything, free)
+    assert float(form) == pytest.approx(float(product), rel=1e-10)
 
 
 @pytest.mark.slow

@@ -9,18 +9,12 @@ import pytest
 from conftest import epsilon
 
 import vsr_jax as vsr
-from vsr_jax.mechanics.balance import (
-    free_components,
-    residual,
-    spread,
-    thread_direction,
-    thread_wrench,
-    with_locked,
-)
+from vsr_jax.mechanics.balance import residual, thread_direction, thread_wrench, with_locked
 from vsr_jax.mechanics.loading import loading
 from vsr_jax.mechanics.reaction import react
 from vsr_jax.models.base import Nodes
 from vsr_jax.numerics import lanczos
+from vsr_jax.numerics.component import free_components, spread
 from vsr_jax.numerics.lanczos import Operator, extreme_pairs
 from vsr_jax.solution.stability import arm_of, extreme
 

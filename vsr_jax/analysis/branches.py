@@ -24,12 +24,12 @@ from jaxtyping import Array, Float
 
 from ..arm.scene import Scene
 from ..mechanics.arm_balance import ArmSolution, ArmUnknown, imbalance_of, problem_of, state_of
-from ..mechanics.balance import free_components, spread, with_locked
+from ..mechanics.balance import with_locked
 from ..mechanics.coupling import ArmProblem, forces_at
 from ..models.base import Outcome, Status, resolved
 from ..models.strain_dependent import StrainDependent
 from ..numerics.compiling import program
-from ..numerics.component import add, multiply, subtract
+from ..numerics.component import add, free_components, multiply, spread, subtract
 from ..numerics.quadrature import Grid
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve, status_of_inputs

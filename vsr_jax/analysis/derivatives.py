@@ -15,10 +15,11 @@ from jaxtyping import Array, Float
 from ..arm.loads import TipWrench
 from ..arm.scene import Scene
 from ..arm.scene_numbers import parameters, replaced
-from ..mechanics.balance import free_block, tangent
+from ..mechanics.balance import tangent
 from ..models.base import Near
 from ..numerics import component as c
 from ..numerics.compiling import program
+from ..numerics.component import free_block
 from ..numerics.se3 import skew, unskew
 from ..solution.equilibrium import Equilibrium
 from ..typing import Pose, ScalarLike, VectorLike

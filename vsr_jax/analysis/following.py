@@ -75,8 +75,7 @@ def follow(
     """
     instance("scene", scene, Scene, "a Scene")
     model = StrainDependent() if model is None else model
-    instance("model", model, Model, "a StrainDependent, the only model with a memory")
-    if not model.remembers:
+    if not (isinstance(model, Model) and model.remembers):
         raise ValueError(
             f"model: got {model}, need a StrainDependent, the only model with a memory"
         )

@@ -17,10 +17,10 @@ from jaxtyping import Array
 
 from ..arm.scene import Scene
 from ..files.output import plain
-from ..mechanics.balance import free_components, thread_direction, thread_wrench
+from ..mechanics.balance import thread_direction, thread_wrench
 from ..models.base import Model, Status
 from ..numerics.compiling import program
-from ..numerics.component import norm, scale, split, times
+from ..numerics.component import free_components, norm, scale, split, times
 from ..numerics.quadrature import make_grid
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve

@@ -22,7 +22,7 @@ from ..numerics import component as c
 from ..numerics.component import Matrix, Vector
 from ..numerics.once import once
 from ..numerics.quadrature import Grid
-from ..numerics.stacked import cross, matmul, rows, stack, total, transpose, turned
+from ..numerics.stacked import components, cross, matmul, rows, stack, total, transpose, turned
 from .coupled import Coupled
 from .definiteness import UNSTABLE_SECTION, Definiteness, definiteness
 from .hinge_passes import multiplied_by_hinges, solved_by_hinges, solved_by_joints
@@ -77,17 +77,17 @@ class Chain(NamedTuple):
         *arms), both zero for locked strains and on rigid pieces."""
         coupled, H = self.coupled, c.symmetric(self.stiffness)
         if coupled is None or min(self.free) > 2:
-            return self._free_part(jnp.stack(c.matvec(H, strain)))
+            return c.times(self.flexible, self._free_part(jnp.stack(c.matvec(H, strain))))
         change, _ = self._sides(strain, None)
         world, back = self._turned(coupled.rotation, change), transpose(coupled.rotation)
         if coupled.motion == 6:
             hinges = self._hinges(coupled, jnp.zeros_like(change), None, 0)
             wrench = multiplied_by_hinges(hinges, world, self.grid)
-            return self._free_part(self._turned(back, wrench))
+            return c.times(self.flexible, self._free_part(self._turned(back, wrench)))
         nodes = step_nodes(H, change[:, 0], coupled, self.grid, self.flexible)
         moved = jax.vmap(lambda x: changes_by_steps(nodes, x, self.grid), 1, 1)(world)
         stiff = jnp.stack(c.matvec(H, tuple(change)))
-        return self._free_part(stiff - self._turned(back, moved))
+        return c.times(self.flexible, self._free_part(stiff - self._turned(back, moved)))
 
     def motions(self, strain: Vector) -> Array:
         """Rotations and displacements (6, stages, steps, *arms) in the world's axes, behind the
@@ -122,14 +122,11 @@ class Chain(NamedTuple):
 
     def _each_alone(self, right: Vector) -> tuple[Vector, Definiteness]:
         """The solution where no section acts on another."""
-        rows = tuple(c.times(self.flexible, right[i]) for i in self.free)
-        block = tuple(tuple(self.stiffness[i][j] for j in self.free if j <= i) for i in self.free)
-        x = c.cholesky_solve(c.cholesky(block), rows)
+        right = c.free_components(c.times(self.flexible, right), self.free)
+        x = c.cholesky_solve(c.cholesky(c.free_block(self.stiffness, self.free)), right)
         unstable = jnp.any(jnp.isnan(x[-1]), axis=(0, 1, 2))
-        none = jnp.zeros_like(x[0])
-        found = tuple(x[self.free.index(i)] if i in self.free else none for i in range(6))
         negative = jnp.where(unstable, UNSTABLE_SECTION, 0).astype(jnp.int32)
-        return found, Definiteness(negative, jnp.zeros_like(unstable))
+        return c.spread(x, self.free), Definiteness(negative, jnp.zeros_like(unstable))
 
     def _by_steps(self, coupled: Coupled, b: Array) -> tuple[Vector, Definiteness]:
         """The solution where sections only turn what acts on others."""
@@ -168,7 +165,6 @@ class Chain(NamedTuple):
         return jnp.concatenate([matmul(R, part) for part in parts])
 
     def _free_part(self, x: Array) -> Vector:
-        """Six components, zero for locked strains (turning a strain into the world's axes and back
-        leaves rounding in these) and on rigid pieces."""
-        none = jnp.zeros_like(x[0])
-        return tuple(c.times(self.flexible, x[i]) if i in self.free else none for i in range(6))
+        """Six components, zero for locked strains: turning a strain into the world's axes and back
+        leaves rounding in these."""
+        return c.spread(c.free_components(components(x), self.free), self.free)

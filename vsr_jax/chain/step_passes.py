@@ -60,7 +60,8 @@ def solved_by_steps(
 def changes_by_steps(nodes: StepNodes, strain: Array, grid: Grid) -> Array:
     r"""What a change of strain in the world's axes does to the wrenches on the sections,
     $(\delta m - \theta \times m, \ \delta n - \theta \times n)$, both (6, stages, steps, *arms)."""
-    arms, last = nodes.axis.ndim - 3, 2 - nodes.axis.ndim
+    arms = nodes.axis.ndim - 3
+    last = -1 - arms
     places = places_of(grid) if arms else (jnp.arange(len(grid.h)),)
     nodes = _apart(nodes, grid) if arms else nodes
 

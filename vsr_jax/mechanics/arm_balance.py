@@ -12,10 +12,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from ..arm.scene import Scene, shared
-from ..numerics.component import Forces, Vector
+from ..numerics.component import Forces, Vector, free_components
 from ..numerics.quadrature import Grid
 from ..numerics.stacked import components, stack
-from .balance import free_components, residual
+from .balance import residual
 from .cable import lengths_of
 from .contact_scales import contacts_of
 from .coupling import ArmProblem, ArmState, Carried, Coupling, Shares, forces_at, loads_with

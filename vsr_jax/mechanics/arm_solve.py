@@ -21,7 +21,7 @@ from ..numerics.batching import (
     queued,
     side_by_side,
 )
-from ..numerics.component import Vector
+from ..numerics.component import Vector, free_components, spread
 from ..numerics.damped_newton import LOAD_INCREMENTS, MAX_TURN, damped_newton
 from ..numerics.damped_rules import HARDENING_STAGES, Damped, Measures
 from ..numerics.implicit import implicit_root
@@ -31,15 +31,7 @@ from ..numerics.stacked import components, stack, total
 from ..typing import cast
 from .arm_balance import ArmImbalance, ArmUnknown, imbalance_of, rounding_of, state_of
 from .arm_tangent import approximate_solve, followed, tangent_solve
-from .balance import (
-    completed,
-    free_components,
-    residual,
-    spread,
-    strain_norm,
-    with_locked,
-    without_force,
-)
+from .balance import completed, residual, strain_norm, with_locked, without_force
 from .coupling import ArmProblem, ArmState, clear_of, forces_at
 from .sizes import shape_of, shape_size
 

@@ -14,12 +14,12 @@ from jaxtyping import Array, PyTree
 from ..chain import Border, Chain, Coupled, Definiteness, bordered_solve, with_spans
 from ..chain.spans import Solve, solve_both
 from ..numerics import component as c
-from ..numerics.component import Vector
+from ..numerics.component import Vector, free_components, spread
 from ..numerics.once import once
 from ..numerics.quadrature import Grid
 from ..typing import cast
 from .arm_balance import ArmImbalance, ArmUnknown
-from .balance import free_components, spread, tangent
+from .balance import tangent
 from .coupling import ArmProblem, ArmState, borders_of, points_of
 from .loading import Loading
 from .point_forces import PointForces

@@ -45,9 +45,12 @@ from ..numerics.component import (
     cholesky,
     cholesky_solve,
     dot,
+    free_block,
+    free_components,
     multiply,
     scale,
     single,
+    spread,
     subtract,
     times,
 )
@@ -182,23 +185,6 @@ def forces_where(sound: Array, tau: Forces) -> Forces:
 def without_force(tau: Forces) -> Forces:
     """Forces of zero in place of `tau`."""
     return tuple(jnp.zeros_like(force) for force in tau)
-
-
-def free_components(vector: Vector, free: tuple[int, ...]) -> Vector:
-    """Components of the free strains."""
-    return tuple(vector[i] for i in free)
-
-
-def free_block(lower: Matrix, free: tuple[int, ...]) -> Matrix:
-    """Lower triangle of the block of the free strains in a symmetric matrix."""
-    return tuple(tuple(lower[i][j] for j in free if j <= i) for i in free)
-
-
-def spread(vector: Vector, free: tuple[int, ...]) -> Vector:
-    """Six components from those of the free strains, zero for the locked ones."""
-    return tuple(
-        vector[free.index(i)] if i in free else jnp.zeros_like(vector[0]) for i in range(6)
-    )
 
 
 def completed(free_part: Vector, sections: CrossSections, free: tuple[int, ...]) -> Vector:

@@ -16,18 +16,11 @@ from jaxtyping import Array
 from ..arm.routing import Path, thread_tangent
 from ..arm.scene import CrossSections
 from ..numerics import component as c
-from ..numerics.component import Forces, Vector
+from ..numerics.component import Forces, Vector, free_block, free_components
 from ..numerics.implicit import change_of
 from ..numerics.once import once
 from ..numerics.quadrature import Grid, beyond, interpolation, locate, weighted, within
-from .balance import (
-    completed,
-    free_block,
-    free_components,
-    over_threads,
-    tangent,
-    thread_wrench,
-)
+from .balance import completed, over_threads, tangent, thread_wrench
 
 
 def turned(turning: Array, kinks: Array | None, grid: Grid) -> Array:

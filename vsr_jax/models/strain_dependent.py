@@ -25,18 +25,16 @@ from ..mechanics.arm_balance import (
 from ..mechanics.arm_solve import solve_arm
 from ..mechanics.balance import (
     forces_where,
-    free_components,
     newton_step,
     residual,
     solve_balance,
-    spread,
     strain_norm,
     without_force,
 )
 from ..mechanics.coupling import ArmProblem, Coupling
 from ..mechanics.loading import Loading
 from ..mechanics.reaction import react_at
-from ..numerics.component import Forces, Vector
+from ..numerics.component import Forces, Vector, free_components, spread
 from ..numerics.magnus import ORDERS
 from ..numerics.quadrature import Grid
 from ..validation import choice, count

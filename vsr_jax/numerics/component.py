@@ -140,6 +140,23 @@ def matvec(matrix: Matrix, vector: Vector) -> Vector:
     return tuple(dot(row, vector) for row in matrix)
 
 
+def free_components(vector: Vector, free: tuple[int, ...]) -> Vector:
+    """Components of the free strains."""
+    return tuple(vector[i] for i in free)
+
+
+def free_block(lower: Matrix, free: tuple[int, ...]) -> Matrix:
+    """Lower triangle of the block of the free strains in a symmetric matrix."""
+    return tuple(tuple(lower[i][j] for j in free if j <= i) for i in free)
+
+
+def spread(vector: Vector, free: tuple[int, ...]) -> Vector:
+    """Six components from those of the free strains, zero for the locked ones."""
+    return tuple(
+        vector[free.index(i)] if i in free else jnp.zeros_like(vector[0]) for i in range(6)
+    )
+
+
 def cholesky(lower: Matrix) -> Matrix:
     """Cholesky factor $L$, $A = L L^T$, of a symmetric matrix, unrolled.
 

@@ -18,14 +18,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..arm.scene import CrossSections, Scene
 from ..mechanics.arm_balance import ArmUnknown, imbalance_of, state_of
-from ..mechanics.balance import (
-    free_block,
-    free_components,
-    spread,
-    tangent,
-    thread_direction,
-    thread_wrench,
-)
+from ..mechanics.balance import tangent, thread_direction, thread_wrench
 from ..mechanics.cable import chords_of
 from ..mechanics.contact import Contacts
 from ..mechanics.coupling import ArmProblem
@@ -33,7 +26,7 @@ from ..mechanics.loading import loading
 from ..mechanics.reaction import rotations
 from ..models.base import Nodes
 from ..numerics import component as c, lu, stacked
-from ..numerics.component import Vector
+from ..numerics.component import Vector, free_block, free_components, spread
 from ..numerics.implicit import change_of
 from ..numerics.lanczos import Operator, extreme_pairs
 from ..numerics.quadrature import Grid
