@@ -20,8 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import vsr_jax as vsr
+from vsr_jax.elements.problem import loading
 from vsr_jax.mechanics.balance import residual
-from vsr_jax.mechanics.loading import loading
 from vsr_jax.mechanics.reaction import react
 from vsr_jax.solution.equilibrium import Equilibrium
 from vsr_jax.solution.stability import extreme

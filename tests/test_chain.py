@@ -204,7 +204,7 @@ def test_stiffness_across_spans(name, apart):
 def test_a_border():
     of = chain(9)
     columns, b, right = sides(of, seed=10), sides(of, 1), jnp.array([0.3, -0.2])
-    border = Border(columns, columns, -jnp.ones(2), jnp.array([0.5, 0.0]))
+    border = Border(columns, columns, -jnp.ones(2), jnp.array([0.5, 0.0]), jnp.ones(2, int))
     found, answers = of.solve(b)[0], of.solve(columns)[0]
     strain, x, _ = bordered_solve(tuple(x[0] for x in found), answers, right, border, of.grid)
     w = rows(of, columns)

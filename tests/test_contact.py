@@ -11,9 +11,9 @@ from conftest import central_differences, with_derivative
 
 import vsr_jax as vsr
 from vsr_jax.arm.rod import STRAINS
+from vsr_jax.elements.nearest import lying
+from vsr_jax.elements.touch import Touch, _handed
 from vsr_jax.files.scene_file import parse_scene, to_toml
-from vsr_jax.mechanics.nearest import lying
-from vsr_jax.mechanics.touch import Touch, _handed
 from vsr_jax.solution.bearing import _at_ends
 from vsr_jax.viz.annotate import rows_of
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import vsr_jax as vsr
+from vsr_jax.elements.problem import problem_of
 from vsr_jax.mechanics.arm_balance import (
     ArmImbalance,
     ArmUnknown,
     imbalance_of,
-    problem_of,
     state_of,
 )
 from vsr_jax.mechanics.arm_tangent import approximate_solve

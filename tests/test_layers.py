@@ -16,6 +16,7 @@ PACKAGES = (
     "chain",
     "arm",
     "mechanics",
+    "elements",
     "models",
     "solution",
     "files",

@@ -9,7 +9,7 @@ import pytest
 
 import vsr_jax as vsr
 from vsr_jax.arm.scene_numbers import replaced
-from vsr_jax.mechanics.loading import loading
+from vsr_jax.elements.problem import loading
 from vsr_jax.mechanics.reaction import react
 from vsr_jax.solution.stability import arm_of
 from vsr_jax.studies.timing import primitives

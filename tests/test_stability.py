@@ -9,8 +9,8 @@ import pytest
 from conftest import epsilon
 
 import vsr_jax as vsr
+from vsr_jax.elements.problem import loading
 from vsr_jax.mechanics.balance import residual, thread_direction, thread_wrench, with_locked
-from vsr_jax.mechanics.loading import loading
 from vsr_jax.mechanics.reaction import react
 from vsr_jax.models.base import Nodes
 from vsr_jax.numerics import lanczos

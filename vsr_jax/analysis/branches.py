@@ -23,7 +23,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from ..arm.scene import Scene
-from ..mechanics.arm_balance import ArmSolution, ArmUnknown, imbalance_of, problem_of, state_of
+from ..elements.problem import problem_of
+from ..mechanics.arm_balance import ArmSolution, ArmUnknown, imbalance_of, state_of
 from ..mechanics.balance import with_locked
 from ..mechanics.coupling import ArmProblem, forces_at
 from ..models.base import Outcome, Status, resolved
@@ -186,7 +187,10 @@ def _system(scene: SceneOrPath, path: InputPath, start: Equilibrium) -> tuple[_S
     unknown = ArmUnknown(free_components(start.state.xi, free), start.state.coupled)
     scale = ArmUnknown(
         tuple(share * length if i < 3 else share for i in free),
-        tuple(coupling.radians(problem) for coupling in problem.couplings),
+        tuple(
+            jax.tree.map(jnp.broadcast_to, one.scales(problem).radians, jax.tree.map(jnp.shape, x))
+            for one, x in zip(problem.couplings, unknown.coupled, strict=True)
+        ),
     )
     values, scale = (ravel_pytree(_at_nodes(x, problem.grid))[0] for x in (unknown, scale))
     return _System(scene, path, model, lax.stop_gradient(scale)), lax.stop_gradient(

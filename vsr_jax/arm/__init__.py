@@ -4,8 +4,8 @@ around it, and the scene that combines them.
 Data and their geometry only. Must not know how an equilibrium is found or how a scene is stored.
 """
 
-from .actuator import Actuator, Chamber, Tendon, Thread
-from .held import Held
+from .actuator import Actuator, Chamber, Tendon, Thread, ThreadState
+from .held import Held, Support
 from .loads import DistributedWrench, Frame, Gravity, Load, PointWrench, TipWrench
 from .material import Material
 from .obstacles import Box, Cylinder, Field, Obstacle, Plane, Sphere
@@ -85,9 +85,11 @@ __all__ = [
     "Spline",
     "SplineProfile",
     "Spring",
+    "Support",
     "Taper",
     "Tendon",
     "Thread",
+    "ThreadState",
     "TipWrench",
     "Tube",
     "parameters",

@@ -2,7 +2,7 @@
 positive pushes)."""
 
 from abc import abstractmethod
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,8 +15,25 @@ from .description import Part
 from .routing import Routing
 
 
+class ThreadState(NamedTuple):
+    """What the law of an actuator may depend on, beside its input.
+
+    **Fields:** the signed `force` $\\tau$ [N] at the start of the thread; the `length` [m] of its
+    path, less what the thread itself stretches; the length of the path of the arm at `rest` [m];
+    `scale` [N/m]: the axial stiffness $EA / L$ of the arm, by which lengths compare to forces.
+    """
+
+    force: Scalar
+    length: Scalar
+    rest: Scalar
+    scale: Scalar
+
+
 class Actuator(Part):
-    """A thread along a routing, driven by one input.
+    r"""A thread along a routing, driven by one input.
+
+    The force in it is `force`(input), or if it depends on the length of the thread too, it follows
+    from `law`($\tau$ and length, input) = 0, and `force` is where a solve begins.
 
     **Arguments shared by all:**
     - `routing`: the thread's path.
@@ -40,8 +57,13 @@ class Actuator(Part):
         return float("-inf")
 
     @property
+    def law_driven(self) -> bool:
+        """Whether the force is an unknown, which follows from `law`."""
+        return type(self).law is not Actuator.law
+
+    @property
     def length_driven(self) -> bool:
-        """Whether the input is a change of length, so that the force is an unknown."""
+        """Whether the input is a change of length."""
         return False
 
     @property
@@ -57,9 +79,12 @@ class Actuator(Part):
 
     @property
     def cable_stiffness(self) -> Scalar | None:
-        """Axial stiffness [N] of a thread that is driven by its length; None if it cannot be
-        stretched."""
+        """Axial stiffness [N] of a thread with a `law`; None if it cannot be stretched."""
         return None
+
+    def free_length(self, rest: ScalarLike, value: ScalarLike) -> Scalar:
+        """Length [m] of the thread without force, for an input."""
+        return real(rest)
 
     @property
     def pressure_area(self) -> Scalar | None:
@@ -91,6 +116,11 @@ class Actuator(Part):
     @abstractmethod
     def force(self, value: ScalarLike) -> Scalar:
         """Signed thread force $\\tau$ [N] for an input."""
+
+    def law(self, thread: ThreadState, value: ScalarLike) -> Scalar:
+        r"""A force [N] that is zero where the force of the thread fits its length and the input,
+        and that falls as $\tau$ rises; $F(a) - \tau$ by default, with F the `force`."""
+        return self.force(value) - thread.force
 
     @property
     def breakpoints(self) -> tuple[Scalar, ...]:
@@ -268,6 +298,10 @@ class Tendon(Actuator):
         return float("-inf") if self.length_driven else 0.0
 
     @property
+    def law_driven(self) -> bool:
+        return self.length_driven
+
+    @property
     def length_driven(self) -> bool:
         return self.control == "length"
 
@@ -310,6 +344,16 @@ class Tendon(Actuator):
         """$\\tau = -T$; zero, the first iterate, for a tendon driven by its length."""
         value = real(value)
         return -value if self.control == "tension" else jnp.zeros_like(value)
+
+    def free_length(self, rest: ScalarLike, value: ScalarLike) -> Scalar:
+        return real(rest) + real(value) if self.length_driven else real(rest)
+
+    def law(self, thread: ThreadState, value: ScalarLike) -> Scalar:
+        """The smaller of tension and slack, as a force."""
+        if not self.length_driven:
+            return super().law(thread, value)
+        slack = thread.scale * (self.free_length(thread.rest, value) - thread.length)
+        return jnp.where(-thread.force < slack, -thread.force, slack)
 
 
 class Chamber(Actuator):

@@ -1,18 +1,66 @@
-"""Held sections: points of an arm that are pinned, clamped or guided in space."""
+"""Sections of an arm that are held in space: pinned, clamped, guided, or by rows of one's own."""
 
-from typing import ClassVar
+from abc import abstractmethod
+from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..numerics.se3 import rotation_vector
+from ..numerics.stacked import matmul, matvec, transpose
 from ..typing import MatrixLike, Scalar, ScalarLike, VectorLike, real
 from ..validation import is_traced, numbers, rigid
 from .description import Part
+from .pose_loads import Needs
 from .rod import Rod
 
 
-class Held(Part):
+class Support(Part):
+    r"""A section whose pose satisfies $g(R, r) = 0$.
+
+    A subclass defines `deviation`, the rows g, and their `units`. The wrench that holds the
+    section, the support reaction, is part of the solution: $\lambda \cdot \partial g$ with one
+    unknown $\lambda$ for each row. The rows must not depend on each other, and be differentiable
+    wherever a section may be.
+    """
+
+    X: eqx.AbstractVar[Scalar | None]
+    effect: eqx.AbstractClassVar[str]
+
+    @property
+    @abstractmethod
+    def units(self) -> tuple[str, ...]:
+        """Unit of each row: "m" for lengths, "rad" for angles."""
+
+    @abstractmethod
+    def deviation(
+        self, base: MatrixLike, rotation: MatrixLike, position: VectorLike
+    ) -> Float[Array, " rows"]:
+        """The rows g, for the pose of the base (4, 4), the rotation R (3, 3) and the position r
+        (3,) [m] of the section."""
+
+    @property
+    def needs(self) -> Needs:
+        r"""What of the pose the wrench $\lambda \cdot \partial g$ depends on."""
+        return "pose"
+
+    @property
+    def fixed(self) -> bool:
+        """Whether the section has a given place."""
+        return False
+
+    def place(self, rod: Rod) -> Scalar:
+        """Abscissa [m]."""
+        return rod.length if self.X is None else self.X
+
+    def settled(self, rotation: MatrixLike, position: VectorLike) -> "Support":
+        """The support of a section in that pose, where it is needed at rest; the same by
+        default."""
+        return self
+
+
+class Held(Support):
     r"""A section held in space: its position r(X), its orientation R(X), or both.
 
     $$r(X) = p, \quad R(X) = R_0,$$
@@ -35,7 +83,7 @@ class Held(Part):
     position: Float[Array, "3"] | None = eqx.field(metadata={"unit": "m"})
     orientation: Float[Array, "3 3"] | None
     along: Float[Array, "3"] | None
-    effect: ClassVar[str] = "held section"
+    effect = "held section"
 
     def __init__(
         self,
@@ -58,16 +106,44 @@ class Held(Part):
         if self.along is not None and not is_traced(self.along) and not jnp.any(self.along != 0):
             raise ValueError("Held.along: got (0, 0, 0), need a direction")
 
-    def place(self, rod: Rod) -> Scalar:
-        """Abscissa [m]."""
-        return rod.length if self.X is None else self.X
+    @property
+    def units(self) -> tuple[str, ...]:
+        lengths = 0 if self.position is None else 3 if self.along is None else 2
+        angles = 0 if self.orientation is None else 3
+        return (*(("m",) * lengths), *(("rad",) * angles))
 
-    def directions(self, axes: MatrixLike) -> Float[Array, "3 forces"] | None:
-        """Unit vectors of the world in which its position is held, along `axes` where it can be;
-        None if it may move."""
-        if self.position is None:
-            return None
-        axes = real(axes)
+    @property
+    def needs(self) -> Needs:
+        return "rotation"
+
+    @property
+    def fixed(self) -> bool:
+        return self.position is not None
+
+    def settled(self, rotation: MatrixLike, position: VectorLike) -> "Held":
+        return replace(
+            self,
+            position=None if self.position is None else real(position),
+            orientation=None if self.orientation is None else real(rotation),
+        )
+
+    def deviation(
+        self, base: MatrixLike, rotation: MatrixLike, position: VectorLike
+    ) -> Float[Array, " rows"]:
+        r"""$e_j \cdot (r - p)$ and $e_j \cdot \log(R R_0^T)$, with the axes $e_j$ of the base where
+        they can be: an arm in a plane, wherever it lies, cannot move along one of them, and its
+        support does not push there."""
+        axes, rows = real(base)[:3, :3], []
+        if self.position is not None:
+            apart = real(position) - self.position
+            rows.append(matvec(transpose(self._directions(axes)), apart))
+        if self.orientation is not None:
+            off = rotation_vector(matmul(real(rotation), transpose(self.orientation)))
+            rows.append(matvec(transpose(axes), off))
+        return jnp.concatenate(rows)
+
+    def _directions(self, axes: Array) -> Float[Array, "3 forces"]:
+        """Unit vectors of the world in which its position is held, along `axes` where it can be."""
         if self.along is None:
             return axes
         a = self.along / jnp.sqrt(jnp.sum(self.along**2))

@@ -18,7 +18,7 @@ from ..validation import concrete, instance, instances, is_traced, numbers, prec
 from .actuator import Actuator
 from .description import Part, describe, described_arguments, table
 from .discs import inner_discs, rest_length, shared_discs
-from .held import Held
+from .held import Support
 from .loads import Frame, Load
 from .obstacles import Obstacle
 from .pose_loads import PoseLoad
@@ -113,7 +113,7 @@ class Scene(Part):
     rod: Rod
     actuators: tuple[Actuator, ...]
     loads: tuple[Load, ...]
-    held: tuple[Held, ...]
+    held: tuple[Support, ...]
     free_strains: tuple[str, ...] = eqx.field(static=True)
     obstacles: tuple[Obstacle, ...]
 
@@ -123,7 +123,7 @@ class Scene(Part):
         actuators: Sequence[Actuator] | Actuator = (),
         loads: Sequence[Load] | Load = (),
         *,
-        held: Sequence[Held] | Held = (),
+        held: Sequence[Support] | Support = (),
         free_strains: Sequence[str] = STRAINS,
         obstacles: Sequence[Obstacle] | Obstacle = (),
     ):
@@ -134,7 +134,7 @@ class Scene(Part):
         self.loads = instances(
             "Scene.loads", loads, Load, "a Gravity, TipWrench, Spring or other load"
         )
-        self.held = instances("Scene.held", held, Held, "a Held")
+        self.held = instances("Scene.held", held, Support, "a Held")
         names = (free_strains,) if isinstance(free_strains, str) else tuple(free_strains)
         if not names or any(name not in STRAINS for name in names):
             raise ValueError(
@@ -188,6 +188,11 @@ class Scene(Part):
         return tuple(i for i, actuator in enumerate(self.actuators) if actuator.length_driven)
 
     @property
+    def law_driven(self) -> tuple[int, ...]:
+        """Indices of the actuators whose force is an unknown, which follows from their law."""
+        return tuple(i for i, actuator in enumerate(self.actuators) if actuator.law_driven)
+
+    @property
     def frictional(self) -> tuple[int, ...]:
         """Indices of the actuators with friction."""
         return tuple(i for i, actuator in enumerate(self.actuators) if actuator.frictional)
@@ -205,8 +210,8 @@ class Scene(Part):
     @property
     def coupled(self) -> bool:
         """Whether the cross-sections depend on each other: through loads, held sections, obstacles,
-        straight tendons, given thread lengths or friction."""
-        return bool(self.reacts or self.length_driven or self.frictional)
+        straight tendons, laws of actuators (as of given lengths) or friction."""
+        return bool(self.reacts or self.law_driven or self.frictional)
 
     @property
     def loaded(self) -> bool:

@@ -15,7 +15,7 @@ from ..typing import Scalar
 from ..validation import ROUNDING, concrete, is_traced, numbers
 from .actuator import Actuator
 from .discs import check_discs
-from .held import Held
+from .held import Support
 from .loads import Load
 from .obstacles import Obstacle
 from .profile import Limits
@@ -93,7 +93,7 @@ def _check_places(
             )
 
 
-def check_held(rod: Rod, held: Sequence[Held]) -> None:
+def check_held(rod: Rod, held: Sequence[Support]) -> None:
     """Raises `ValueError` if a held section is beyond the arm or is held twice."""
     length, places = float(rod.length), [float(one.place(rod)) for one in held]
     for i, X in enumerate(places):

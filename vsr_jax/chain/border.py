@@ -22,12 +22,15 @@ class Border(NamedTuple):
     - `rows`: R, for each row a wrench at the nodes; its work over a change of strain, times the
       factor, is the change of the row.
     - `factors`: F, shape (m, ...). `corner`: the diagonal of D, shape (m, ...).
+    - `resists`: 1 where a negative pivot of the Schur complement is an unstable motion that the
+      unknown prevents, -1 where it is one that it causes, shape (m, ...).
     """
 
     columns: Vector
     rows: Vector
     factors: Array
     corner: Array
+    resists: Array
 
 
 def listed(parts: tuple[Array, ...]) -> Array:
@@ -42,10 +45,9 @@ def bordered_solve(
     strain: Vector, answers: Vector, right: Array, border: Border, grid: Grid
 ) -> tuple[Vector, Array, Array]:
     """Solution of a system with a border: the strain, the unknowns of the couplings, and the number
-    of negative pivots of the Schur complement.
-
-    Each negative pivot is an unstable motion of the arm alone that the couplings prevent: the arm
-    is stable if its tangent has no more negative eigenvalues than that.
+    of unstable motions of the arm alone that the couplings prevent, less those that they cause, by
+    the negative pivots of the Schur complement: the arm is stable if its tangent has no more
+    negative eigenvalues than that.
 
     **Arguments:** `strain`, `answers`: solutions of the system of the strains for their right side,
     and for each of the columns; `right`: that of the couplings, shape (m, ...).
@@ -61,8 +63,9 @@ def bordered_solve(
     schur = unit * border.corner[:, None] - border.factors[:, None] * pulled
     rounding = float(jnp.finfo(schur.dtype).eps) ** _IDLE
     x, negative = lu.solve_with_pivots(schur, right - border.factors * given, rounding)
+    prevented = jnp.sum(jnp.where(negative, border.resists, 0), axis=0, dtype=jnp.int32)
     strain = tuple(
         a - jnp.sum(x[:, None, None] * answer, axis=0)
         for a, answer in zip(strain, answers, strict=True)
     )
-    return strain, x, negative
+    return strain, x, prevented

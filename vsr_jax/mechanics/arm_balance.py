@@ -15,13 +15,19 @@ from ..arm.scene import Scene, shared
 from ..numerics.component import Forces, Vector, free_components
 from ..numerics.quadrature import Grid
 from ..numerics.stacked import components, stack
+from .applied_load import Loading
 from .balance import residual
-from .cable import lengths_of
-from .contact_scales import contacts_of
-from .coupling import ArmProblem, ArmState, Carried, Coupling, Shares, forces_at, loads_with
-from .friction import friction_of
-from .held import holds_of
-from .loading import Loading, loading
+from .coupling import (
+    ArmProblem,
+    ArmState,
+    Carried,
+    Coupling,
+    Shares,
+    ThreadRule,
+    forces_at,
+    loads_of,
+    loads_with,
+)
 from .reaction import react
 from .sizes import pull_of, shape_of, shape_size
 
@@ -56,41 +62,28 @@ class ArmSolution(NamedTuple):
         `forces` are those at the start."""
         shares = scene.thread_reach(X)
         for coupling, x in zip(self.couplings, self.coupled, strict=True):
-            shares = coupling.shares_at(x, self.xi, scene, grid, X, forces, shares)
+            if isinstance(coupling, ThreadRule):
+                shares = coupling.shares_at(x, self.xi, scene, grid, X, forces, shares)
         return shares
-
-
-def couplings_of(scene: Scene, inputs: Array, problem: ArmProblem) -> tuple[Coupling, ...]:
-    """All couplings of a scene."""
-    grid = problem.grid
-    sections = problem.sections
-    found = (
-        lengths_of(scene, inputs, sections, grid),
-        friction_of(scene, grid),
-        holds_of(scene, sections, grid),
-        contacts_of(scene, sections, grid),
-    )
-    return tuple(coupling for coupling in found if coupling is not None)
-
-
-def problem_of(scene: Scene, inputs: Array, grid: Grid) -> ArmProblem:
-    """The coupled balance of a scene on a grid."""
-    sections = scene.sections(grid.X)
-    bare = ArmProblem(grid, sections, scene.forces(inputs), loading(scene, grid), ())
-    return bare._replace(couplings=couplings_of(scene, inputs, bare))
 
 
 def state_of(xi: Vector, coupled: tuple[PyTree, ...], problem: ArmProblem) -> ArmState:
     """Quantities computed from the unknowns."""
-    grid, couplings = problem.grid, problem.couplings
+    grid, couplings, loads = problem.grid, problem.couplings, problem.loads
     forces = forces_at(couplings, coupled, problem.forces)
     carried = _carried(xi, coupled, problem, forces)
-    loads = loads_with(couplings, coupled, problem.loads)
-    along = None if loads is None else react(xi, grid, loads, forces)
     tau = problem.along_sections(shared(forces, carried.shares))
+    along, by_couplings = None, loads_of(couplings, coupled)
+    if loads is not None:
+        loads = loads.having(tuple(load for own in by_couplings for load in own))
+        along = react(xi, grid, loads, forces)
     at = ArmState(xi, carried, tau, loads, along, ())
-    pairs = zip(couplings, coupled, strict=True)
-    return at._replace(notes=tuple(coupling.note(x, at, problem) for coupling, x in pairs))
+    first, notes = len(at.exerted) - sum(map(len, by_couplings)), []
+    for coupling, x, own in zip(couplings, coupled, by_couplings, strict=True):
+        exerted = at.exerted[first : first + len(own)]
+        notes.append(coupling.note(x, at, exerted, problem))
+        first += len(own)
+    return at._replace(notes=tuple(notes))
 
 
 def _carried(
@@ -98,7 +91,8 @@ def _carried(
 ) -> Carried:
     carried = Carried(problem.sections.reach, problem.sections.reach)
     for coupling, x in zip(problem.couplings, coupled, strict=True):
-        carried = coupling.carried(x, xi, problem, forces, carried)
+        if isinstance(coupling, ThreadRule):
+            carried = coupling.carried(x, xi, problem, forces, carried)
     return carried
 
 
@@ -139,16 +133,10 @@ def rounding_of(problem: ArmProblem) -> Array:
         pull = pull.reshape(len(problem.forces), -1, *length.shape)
         total = total + jnp.sum(jnp.abs(stack(problem.forces)) * jnp.max(pull, axis=1), axis=0)
     if loads is not None:
-        densities = (loads.dead_density, loads.follower_density)
-        wrenches = [length * density for density in densities if density is not None]
-        wrenches += [part for part in (loads.dead,) if part is not None]
-        wrenches += [point.wrench[:, None, None] for point in loads.follower_points]
-        for term in loads.by_pose:
-            size = term.size(loads.base, loads.motion)
-            wrenches.append(length * size if term.step is None else size[:, None, None])
-        for part in wrenches:
-            size = jnp.abs(part)
-            levers = length * jnp.sum(size[3:], axis=0)
-            wrench = (*components(size[:3] + levers), *components(size[3:]))
-            total = total + largest(shape_of(wrench, sections, length))
+        for load in loads.loads:
+            for part in load.sizes(length, loads.base, loads.motion):
+                size = jnp.abs(part)
+                levers = length * jnp.sum(size[3:], axis=0)
+                wrench = (*components(size[:3] + levers), *components(size[3:]))
+                total = total + largest(shape_of(wrench, sections, length))
     return 64 * jnp.finfo(total.dtype).eps * total

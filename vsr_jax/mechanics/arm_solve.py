@@ -130,8 +130,8 @@ def _start(problem: ArmProblem, free: tuple[int, ...]) -> ArmUnknown:
         jnp.where(near, x, x0).astype(exact.dtype)
         for x, x0, exact in zip(xi, rest, problem.sections.rest, strict=True)
     )
-    for coupling in problem.couplings:
-        xi = coupling.start(xi, problem)
+    for constraint in problem.constraints:
+        xi = constraint.start(xi, problem)
     return ArmUnknown(with_locked(xi, problem.sections, free), coupled)
 
 
@@ -263,7 +263,7 @@ def _solve(
 
 def _uneven(problem: ArmProblem) -> bool:
     """Whether some arms of a batch may need several times as many steps as most."""
-    return problem.softens or (problem.loads is not None and problem.loads.turns_chords)
+    return problem.constrained or (problem.loads is not None and problem.loads.spans)
 
 
 def _iteration(
@@ -282,7 +282,7 @@ def _iteration(
 
     def evaluate(point: _Point, damping: Array, share: Array, loose: Array) -> Damped:
         problem = whole.loosened(loose).with_share(share)
-        if whole.softens and guess is None:
+        if whole.constrained and guess is None:
             soft = jnp.clip(2.0 - share, 0.0, 1.0)
             problem = problem.bowed(jnp.where(loose, _BOW * soft, 0.0))
         unknown = _unknown(point, whole, free)
@@ -301,7 +301,7 @@ def _iteration(
         wrench = c.single(imbalance.wrench)
         return Damped(point, size, wrench, merit, definite, doubtful, clear, slides)
 
-    dot = sizes.dot if whole.follows_rate or whole.softens else None
+    dot = sizes.dot if whole.follows_rate or whole.constrained else None
     return damped_newton(
         evaluate,
         Measures(sizes.work, sizes.turn, sizes.stirs(start), dot),
@@ -309,5 +309,5 @@ def _iteration(
         floor,
         1 if whole.loads is None or whole.begins_soft else LOAD_INCREMENTS,
         None if guess is None else origin,
-        stages=HARDENING_STAGES if whole.softens else 0,
+        stages=HARDENING_STAGES if whole.constrained else 0,
     )

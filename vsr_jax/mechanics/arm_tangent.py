@@ -11,7 +11,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
-from ..chain import Border, Chain, Coupled, Definiteness, bordered_solve, with_spans
+from ..chain import Border, Chain, Definiteness, bordered_solve, with_spans
 from ..chain.spans import Solve, solve_both
 from ..numerics import component as c
 from ..numerics.component import Vector, free_components, spread
@@ -20,12 +20,8 @@ from ..numerics.quadrature import Grid
 from ..typing import cast
 from .arm_balance import ArmImbalance, ArmUnknown
 from .balance import tangent
-from .coupling import ArmProblem, ArmState, borders_of, points_of
-from .loading import Loading
-from .point_forces import PointForces
-from .reaction import Reaction, coupled_by
+from .coupling import ArmProblem, ArmState, borders_of, springs_of
 from .sizes import node_weight
-from .sliding import sliding_of
 
 _REFINEMENTS = 60
 """Bound on the refinement steps of a tangent system; 5 to 10 are usual."""
@@ -54,65 +50,56 @@ def approximate_solve(
     and whether that is doubtful.
 
     In single precision: the passes along the arm are bound by memory, and rounding is far below the
-    error of the elimination. Two keep the precision of the unknowns: straight tendons of an arm
-    with loads, whose forces without their turning, which the elimination takes first, are large
-    enough to make its pivots singular, and contacts, which are nearly rigid.
+    error of the elimination. Loads that are nearly rigid keep the precision of the unknowns.
 
     **Arguments:** `symmetric`: with the contact forces that friction follows held; `apart`: solve
     for `right` apart from all that does not depend on it, in place of one pass for everything, so
     that derivatives by `right` repeat only the former.
     """
-    loads = at.loads
-    if loads is None or (loads.around is None and not loads.turns_chords):
+    if at.loads is None or not at.loads.nearly_rigid:
         unknown, at, right, problem, damping = c.single(
             (unknown, at, right, problem, jnp.asarray(damping))
         )
-    sections, grid, flexible = problem.sections, problem.grid, problem.sections.flexible
+    sections, grid, along, loads = problem.sections, problem.grid, at.along, at.loads
     lower = tangent(unknown.xi, sections, at.tau)
     lower = tuple(
         (*row[:-1], row[-1] + damping * s) for row, s in zip(lower, sections.stiffness, strict=True)
     )
-
-    along, loads = at.along, at.loads
-    sliding = None if along is None else sliding_of(along, sections.stiffness, flexible, free, grid)
-    if along is not None and sliding is not None:
-        along = along._replace(touch=sliding.touch)
-    points = points_of(problem, unknown.coupled, at)
+    springs = springs_of(problem, unknown.coupled, at, free)
     if symmetric:
-        points = {place: one._replace(wrench=one.direction) for place, one in points.items()}
-    pushes = [one.pushes(right.coupled[place]) for place, one in points.items()]
-    coupled = None if along is None or loads is None else _coupled(along, loads, points, grid)
-    chain = Chain(lower, free, flexible, coupled, grid)
-    solve: Solve = partial(chain.solve, apart=apart)
-    if along is not None and loads is not None and along.pull is not None:
-        chords = along.pull.springs(along.rotation, cut=loads.only_discs)
-        solve = with_spans(solve, chords, grid, loads.conservative, apart=apart)
-    b = spread(right.wrench, free)
-    if sliding is not None:
-        b, more = sliding.driven(b)
-        pushes = [push + more for push in pushes]
+        springs = {place: one.symmetric() for place, one in springs.items()}
+    coupled = None if along is None or loads is None else along.coupled(loads)
+    b, pushes = spread(right.wrench, free), []
+    for place, one in springs.items():
+        assert coupled is not None  # what presses an arm is a load
+        coupled = one.added_to(coupled)
+        b, push = one.driven(b, right.coupled[place])
+        pushes.append(push)
+    pushes = [sum(pushes[1:], pushes[0])] if pushes else []
+    chain = Chain(lower, free, sections.flexible, coupled, grid)
+    solve = _with_spans(partial(chain.solve, apart=apart), at, apart=apart)
     borders = borders_of(problem, unknown.coupled, at)
+    conservative = loads is None or loads.conservative
     strain, changes, (negative, doubtful) = _bordered(
-        solve, b, pushes, right.coupled, borders, grid, loads, apart=apart
+        solve, b, pushes, right.coupled, borders, grid, conservative, apart=apart
     )
-    for place, one in points.items():
-        moved = chain.motions(strain)
-        changes[place] = one.change(changes[place], moved)
-        if sliding is not None:
-            strain = sliding.followed(strain, moved)
+    if springs:
+        motions = chain.motions(strain)
+        for place, one in springs.items():
+            strain, changes[place] = one.followed(strain, changes[place], motions)
     return ArmUnknown(strain, tuple(changes)), negative == 0, doubtful
 
 
-def _coupled(
-    along: Reaction, loads: Loading, points: dict[int, PointForces], grid: Grid
-) -> Coupled:
-    """How the sections act on each other, with the contacts in their cells."""
-    coupled = coupled_by(along, loads, grid)
-    if along.touch is None:
-        return coupled
-    (springs,) = points.values()
-    cells, part = springs.slopes(along.touch)
-    return coupled._replace(cells=cells, part=part)
+def _with_spans(solve: Solve, at: ArmState, *, apart: bool) -> Solve:
+    """The solution with the stiffness across spans that loads have."""
+    along, loads = at.along, at.loads
+    if along is None or loads is None:
+        return solve
+    for load, exerted in zip(loads.loads, along.exerted, strict=True):
+        spans = load.spans(along.pose, exerted, alone=loads.local)
+        if spans is not None:
+            solve = with_spans(solve, spans, along.pose.grid, loads.conservative, apart=apart)
+    return solve
 
 
 def _bordered(
@@ -122,7 +109,7 @@ def _bordered(
     rows: tuple[PyTree, ...],
     borders: tuple[dict[int, Border], Border | None],
     grid: Grid,
-    loads: Loading | None,
+    conservative: Array | bool,
     *,
     apart: bool,
 ) -> tuple[Vector, list[PyTree], Definiteness]:
@@ -140,7 +127,6 @@ def _bordered(
     for place in places:
         size = len(rows[place])
         coupled[place], first = x[first : first + size], first + size
-    conservative = loads is None or loads.conservative
     return strain, coupled, definiteness.without(held, conservative)
 
 
@@ -185,7 +171,7 @@ def tangent_solve(
 
     b = to_row * flat
     back = jax.linear_transpose(scaled_nearly, b)
-    kept = _KEPT_TOUCHING if problem.softens else _KEPT
+    kept = _KEPT_TOUCHING if problem.constrained else _KEPT
 
     def solve(apply: Callable, b: Array) -> Array:
         return _refined(apply, scaled_nearly, b, kept)
@@ -234,7 +220,7 @@ def _units(problem: ArmProblem, free: tuple[int, ...], like: ArmImbalance) -> tu
     changes."""
     stiffness, weight = problem.sections.stiffness, node_weight(problem.grid)
     root = tuple(jnp.sqrt(weight * s) for s in free_components(stiffness, free))
-    pairs = [coupling.units(problem) for coupling in problem.couplings]
+    pairs = [coupling.scales(problem).units for coupling in problem.couplings]
     rows = ArmImbalance(tuple(weight / x for x in root), tuple(row for row, _ in pairs))
     changes = ArmImbalance(tuple(1 / x for x in root), tuple(change for _, change in pairs))
     row, change = (

@@ -8,9 +8,10 @@ m(X) = \sum_{X_i > X} M_i + \int_X^L (c + p' \times n) \, ds, \quad
 
 Two passes along the arm: rotations from the base to the tip, wrenches from the tip to the base.
 Positions are computed only if a load depends on them. Wrenches jump only at the ends of steps, but
-for contact forces (see `touch`).
+for loads that say so (`AppliedLoad.within_step`).
 """
 
+from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -26,12 +27,10 @@ from ..numerics.magnus import magnus_6
 from ..numerics.once import once
 from ..numerics.quadrature import (
     Grid,
-    before,
     beyond,
     gauss_legendre,
     interpolation,
     locate,
-    sum_along,
     weighted,
     within,
 )
@@ -47,42 +46,41 @@ from ..numerics.stacked import (
     transpose,
     turned,
 )
-from .chords import Pull, pull_of
-from .loading import Loading
-from .pose_terms import base_of
-from .touch import Touch, contact_wrenches, touch_of
+from .applied_load import Exerted, Loading, Pose
 
 
 class Reaction(NamedTuple):
-    r"""Results of both passes: matrices (3, 3, ...), vectors (3, ...) and wrenches (6, ...), with
-    the axes (stages, steps) of the nodes behind.
+    r"""Results of both passes: wrenches (6, stages, steps) at the nodes.
 
-    - `starts`, `end`, `rotation`: rotations at the start of each step, (3, 3, steps), at the end of
-      the arm, (3, 3), and at the nodes.
-    - `world`, `density`: wrench $(m, n)$ in the world frame and its density $(c + p' \times n, f)$
-      at the nodes.
-    - `wrench`: $\Lambda$ in the body frame.
-    - `axis`, `points`, `follower`: in the world frame the axis $p'$, the follower wrenches at
-      points (6,) and the follower density.
-    - `body_density`: density (c, f) of all loads in the body frame.
-    - `seen`: rotation and position where each load acts that depends on the pose.
-    - `pull`: the chords of straight tendons, whose wrenches are parts of `world` and `wrench`.
-    - `touch`: the contacts.
+    - `pose`: where the sections are.
+    - `world`, `density`: wrench $(m, n)$ in the world frame and its density $(c + p' \times n, f)$.
+    - `wrench`: $\Lambda$ in the body frame. `body_density`: density (c, f) of all loads there.
+    - `exerted`: what each load exerts.
     """
 
-    starts: Array
-    end: Array
-    rotation: Array
+    pose: Pose
     world: Array
     density: Array
     wrench: Array
-    axis: Array
-    points: tuple[Array, ...]
-    follower: Array | None
     body_density: Array
-    seen: tuple[tuple[Array, Array | None], ...]
-    pull: Pull | None
-    touch: Touch | None
+    exerted: tuple[Exerted, ...]
+
+    def coupled(self, loading: Loading) -> Coupled:
+        """How the sections act on each other by the loads."""
+        pose, size, alone = self.pose, loading.motion, loading.local
+        each = [
+            load.slopes(pose, exerted, size, alone=alone)
+            for load, exerted in zip(loading.loads, self.exerted, strict=True)
+        ]
+        return Coupled(
+            pose.rotation,
+            pose.axis,
+            self.world,
+            self.density,
+            density=_sum([one.density for one in each]),
+            ends=_sum([one.ends for one in each]),
+            joined=_sum([one.joined for one in each]),
+        )
 
 
 def partial_rotation(k: Array, h: Array, sigma: Array | float) -> Array:
@@ -162,116 +160,32 @@ def _rotations_jvp(primals: tuple, tangents: tuple) -> tuple[tuple, tuple]:
     return (starts, R, end), changes
 
 
-def react(xi: Vector, grid: Grid, loads: Loading, forces: Forces = ()) -> Reaction:
+def react(xi: Vector, grid: Grid, loading: Loading, forces: Forces = ()) -> Reaction:
     """Reaction at the nodes for the strain `xi`, six component arrays of shape (stages, steps,
     *arms), and for the `forces` of the threads at their start."""
     whole = stack(xi)
-    starts, R, end = rotations(rows(whole, 0, 3), grid.h, loads.base)
-    zero, back = jnp.zeros_like(whole), transpose(R)
-    world = zero if loads.dead is None else loads.dead
-    density = zero if loads.dead_density is None else loads.dead_density
-    body_density = turned(back, density)
-    points = tuple(
-        turned(rotation_at(starts, end, point.step), point.wrench)
-        for point in loads.follower_points
-    )
-    for point, wrench in zip(loads.follower_points, points, strict=True):
-        world = world + point.before * wrench[:, None, None]
-    follower = None
-    if loads.follower_density is not None:
-        follower = turned(R, loads.follower_density)
-        density, body_density = density + follower, body_density + loads.follower_density
-        world = world + beyond(follower, grid)
-    axis = matvec(R, rows(whole, 3, 6))
-    seen = _seen(starts, end, R, axis, grid, loads)
-    for term, (turn, place) in zip(loads.by_pose, seen, strict=True):
-        here = term.wrench(turn, place)
-        if term.before is None:
-            density, body_density = density + here, body_density + turned(back, here)
-            world = world + beyond(here, grid)
-        else:
-            world = world + term.before * here[:, None, None]
-    touch = None if loads.around is None else touch_of(axis, R, grid, loads.around)
-    if touch is not None:
-        world = world + contact_wrenches(touch)
+    starts, R, end = rotations(rows(whole, 0, 3), grid.h, loading.base)
+    axis, none = matvec(R, rows(whole, 3, 6)), jnp.zeros_like(whole)
+    pose = Pose(starts, end, R, axis, loading.base, grid, forces)
+    exerted = tuple(load.exerted(pose) for load in loading.loads)
+    wrench = _sum([one.wrench for one in exerted])
+    world = none if wrench is None else wrench
+    load_density = _sum([one.density for one in exerted])
+    density = none if load_density is None else load_density
+    levered = _sum([one.levered for one in exerted])
+    body_density = turned(transpose(R), density)
     arm = cross(axis, rows(world, 3, 6))
     world, density = _with_moment(world, beyond(arm, grid)), _with_moment(density, arm)
-    pull = None
-    if loads.discs is not None:
-        pull = pull_of(loads.discs, starts, end, axis, grid, forces)
-        chords = pull.wrench
-        world = world + chords
-        density = _with_moment(density, cross(axis, rows(chords, 3, 6)))
-    wrench = turned(back, world)
-    return Reaction(
-        starts,
-        end,
-        R,
-        world,
-        density,
-        wrench,
-        axis,
-        points,
-        follower,
-        body_density,
-        seen,
-        pull,
-        touch,
-    )
+    if levered is not None:
+        world = world + levered
+        density = _with_moment(density, cross(axis, rows(levered, 3, 6)))
+    return Reaction(pose, world, density, turned(transpose(R), world), body_density, exerted)
 
 
-def _seen(
-    starts: Array, end: Array, R: Array, axis: Array, grid: Grid, loads: Loading
-) -> tuple[tuple[Array, Array | None], ...]:
-    """Rotation and position where each load acts that depends on the pose; None for positions if no
-    load depends on them."""
-    if not loads.by_pose:
-        return ()
-    positions = loads.motion == 6
-    base = jnp.asarray(base_pose(loads.base, grid.h.dtype))[:3, 3]
-    base = base_of(base, axis.ndim - 3)[:, None, None]
-    along = any(term.step is None for term in loads.by_pose)
-    nodes = base + before(axis, grid) if positions and along else None
-    seen = []
-    for term in loads.by_pose:
-        if term.step is None or term.before is None:
-            seen.append((R, nodes))
-        else:
-            place = (base + sum_along(term.before * axis, grid))[:, 0, 0] if positions else None
-            seen.append((rotation_at(starts, end, term.step), place))
-    return tuple(seen)
-
-
-def coupled_by(along: Reaction, loads: Loading, grid: Grid) -> Coupled:
-    """How the sections act on each other by the loads, without the contacts."""
-    size, density, joined = loads.motion, None, None
-    ends, at_points = None, []
-    if along.pull is not None:
-        cut = loads.only_discs
-        ends = along.pull.cut_slopes(size) if cut else along.pull.slopes(size)
-        joined = along.pull.joined if cut else None
-    if along.follower is not None:
-        density = _turning(along.follower, size)
-    for point, wrench in zip(loads.follower_points, along.points, strict=True):
-        at_points.append((point.step, _turning(wrench, size)))
-    for term, (turn, place) in zip(loads.by_pose, along.seen, strict=True):
-        here = term.slope(turn, place, size)
-        if term.step is not None:
-            at_points.append((term.step, here))
-        else:
-            density = here if density is None else density + here
-    for step, slope in at_points:  # at the end of the step before each
-        there = jnp.arange(grid.h.shape[0]).reshape(-1, *(1,) * step.ndim) == step - 1
-        here = there.astype(grid.h.dtype) * slope[:, :, None]
-        ends = here if ends is None else ends + here
-    world = along.rotation, along.axis, along.world, along.density
-    return Coupled(*world, density, ends, joined=joined)
-
-
-def _turning(wrench: Array, size: int) -> Array:
-    """Derivative (6, size, ...) of a wrench that turns with its section."""
-    turn = jnp.concatenate([-skew(rows(wrench, 0, 3)), -skew(rows(wrench, 3, 6))])
-    return turn if size == 3 else jnp.concatenate([turn, jnp.zeros_like(turn)], axis=1)
+def _sum(parts: Sequence[Array | None]) -> Array | None:
+    """The sum of those that there are."""
+    there = [part for part in parts if part is not None]
+    return sum(there[1:], there[0]) if there else None
 
 
 def _with_moment(wrench: Array, moment: Array) -> Array:
@@ -283,30 +197,24 @@ def _with_moment(wrench: Array, moment: Array) -> Array:
 def react_at(
     xi: Vector,
     grid: Grid,
-    loads: Loading,
+    loading: Loading,
     X: Array,
     forces: Forces = (),
     *,
     smooth: bool = False,
 ) -> Vector:
     r"""Reaction $\Lambda$ at abscissas X, six component arrays of their shape, from the strain at
-    the nodes and the `forces` of the threads at their start. `smooth`: with each contact force
-    spread over its step."""
-    along = react(xi, grid, loads, forces)
+    the nodes and the `forces` of the threads at their start. `smooth`: with each jump inside a step
+    spread over it."""
+    along = react(xi, grid, loading, forces)
     step, sigma = locate(grid, X)
     k = stack(xi[:3])[:, :, step]
     turn = stacked_rotation(partial_rotation(k, grid.h[step], sigma))
-    R = matmul(along.starts[:, :, step], turn)
+    R = matmul(along.pose.starts[:, :, step], turn)
     first = float(gauss_legendre(grid.X.shape[0])[0][0])
     since, q = along.world[:, 0, step], along.density
     world = since + within(q, grid, step, first) - within(q, grid, step, sigma)
-    if along.touch is not None:
-        world = world + along.touch.carried(step, sigma, smooth)
+    for load, exerted in zip(loading.loads, along.exerted, strict=True):
+        jump = load.within_step(exerted, step, sigma, smooth=smooth)
+        world = world if jump is None else world + jump
     return components(turned(transpose(R), world))
-
-
-def rotation_at(starts: Array, end: Array, step: Array) -> Array:
-    """Rotation at the start of a step, or at the end of the arm for the step after the last."""
-    whole = jnp.concatenate([starts, end[:, :, None]], axis=2)
-    here = jnp.arange(whole.shape[2]).reshape(-1, *(1,) * step.ndim) == step
-    return jnp.sum(jnp.where(here, whole, 0.0), axis=2)

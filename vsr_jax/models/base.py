@@ -13,10 +13,11 @@ from jaxtyping import Array, Float
 
 from ..arm.routing import Path, thread_tangent
 from ..arm.scene import CrossSections, Scene, shared, together
-from ..mechanics.arm_balance import ArmUnknown, problem_of
+from ..elements.problem import loading, problem_of
+from ..mechanics.applied_load import Loading
+from ..mechanics.arm_balance import ArmUnknown
 from ..mechanics.balance import thread_direction, thread_wrench
 from ..mechanics.coupling import ArmProblem
-from ..mechanics.loading import Loading, loading
 from ..mechanics.resolution import COARSE, step_error
 from ..numerics.component import Forces, Vector, dot, times
 from ..numerics.magnus import stacked_twist, step_poses, tip_pose

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..arm.scene import CrossSections, Scene
+from ..elements.problem import loading
 from ..mechanics.balance import (
     ALL,
     forces_where,
@@ -20,7 +21,6 @@ from ..mechanics.balance import (
     strain_norm,
     tangent,
 )
-from ..mechanics.loading import loading
 from ..mechanics.reaction import react_at
 from ..numerics import component as c
 from ..numerics.component import Forces, Vector

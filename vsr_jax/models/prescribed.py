@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..arm.scene import CrossSections, Scene
-from ..mechanics.arm_balance import problem_of
+from ..elements.problem import problem_of
 from ..mechanics.balance import (
     force_scale,
     forces_where,

@@ -15,13 +15,9 @@ from jaxtyping import Array, Float
 
 from ..arm.rod import STRAIGHT
 from ..arm.scene import Scene, shared
-from ..mechanics.arm_balance import (
-    ArmSolution,
-    ArmUnknown,
-    carried_from_start,
-    problem_of,
-    state_of,
-)
+from ..elements.problem import problem_of
+from ..mechanics.applied_load import Loading
+from ..mechanics.arm_balance import ArmSolution, ArmUnknown, carried_from_start, state_of
 from ..mechanics.arm_solve import solve_arm
 from ..mechanics.balance import (
     forces_where,
@@ -32,7 +28,6 @@ from ..mechanics.balance import (
     without_force,
 )
 from ..mechanics.coupling import ArmProblem, Coupling
-from ..mechanics.loading import Loading
 from ..mechanics.reaction import react_at
 from ..numerics.component import Forces, Vector, free_components, spread
 from ..numerics.magnus import ORDERS
@@ -147,9 +142,7 @@ class StrainDependent(SteppedModel):
         unknown, balanced, definite, steps, loose = found
         problem = problem.loosened(loose)
         forces, shares = carried_from_start(unknown, problem)
-        tau, sections = problem.along_sections(shared(forces, shares)), problem.sections
-        if problem.loads is not None and problem.loads.discs is not None:
-            sections = problem.loads.discs.beside(sections)
+        tau, sections = problem.along_sections(shared(forces, shares)), problem.sections_of_threads
         status = classify(unknown.xi, sections, tau, balanced, definite, loaded=scene.reacts)
         sound = status == Status.CONVERGED
         xi = rest_where_failed(status, unknown.xi, problem.sections)
@@ -240,8 +233,7 @@ class StrainDependent(SteppedModel):
             None if loads is None else react_at(state.xi, grid, loads, X, forces, smooth=smooth)
         )
         tau = shared(forces, state.shares_at(scene, grid, X, forces))
-        if loads is not None and loads.discs is not None:
-            tau = loads.discs.elsewhere(tau)
+        tau = tau if loads is None else loads.along_sections(tau)
         start = tuple(jnp.interp(X, grid.X.T.reshape(-1), x.T.reshape(-1)) for x in state.xi)
         sections = scene.sections(X)
         xi = solve_balance(sections, tau, reaction, scene.free, start).xi

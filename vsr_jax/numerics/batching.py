@@ -127,6 +127,15 @@ def arms_in(tree: Any, axes: int) -> tuple[int, ...]:
     return np.broadcast_shapes(*(x.shape[x.ndim - axes :] for x in jax.tree.leaves(tree)))
 
 
+def of_each_arm(function: Callable, arms: tuple[int, ...], *arguments: Any) -> Any:
+    """A function of the numbers of one arm, for a batch of shape `arms` (one axis, or none) in the
+    last axis of all arguments, of size 1 where they are the same for all arms."""
+    if not arms:
+        return function(*arguments)
+    every = jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], *arms)), arguments)
+    return jax.vmap(function, -1, -1)(*every)
+
+
 class Iteration(NamedTuple):
     """An iteration of several problems, with one entry per problem in the last axis of each array:
     the state at its beginning, given any state or None; the step to the next state, which leaves

@@ -8,7 +8,7 @@ batch of systems. LAPACK is avoided: two of its batched routines in one program 
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float
 
 
 def factor(matrix: Float[Array, "n n *#arms"]) -> Float[Array, "n n *#arms"]:
@@ -68,8 +68,8 @@ def solve(
 
 def solve_with_pivots(
     matrix: Float[Array, "n n *#arms"], right: Float[Array, "n *#arms"], rounding: float
-) -> tuple[Float[Array, "n *#arms"], Int[Array, " *#arms"]]:
-    """Solution of $A x = b$ and the number of negative pivots, those of the diagonal with the
+) -> tuple[Float[Array, "n *#arms"], Bool[Array, "n *#arms"]]:
+    """Solution of $A x = b$ and which rows have negative pivots, those of the diagonal with the
     greatest first. Where only unknowns are left whose pivots are rounding, they are zero.
 
     **Arguments:** `rounding`: size of a pivot that is rounding where it was 1 at first or less,
@@ -91,9 +91,9 @@ def solve_with_pivots(
         column = jnp.sum(jnp.where(chosen, A, 0.0), axis=1)
         A = jnp.where(chosen[:, None], row, A - column[:, None] * row)
         b = jnp.where(chosen, value, b - column * value)
-        return A, b, left & ~chosen, negative + (pivot < 0).astype(jnp.int32)
+        return A, b, left & ~chosen, negative | (chosen & (pivot < 0))
 
-    none = jnp.zeros(right.shape[1:], jnp.int32)
-    start = matrix, right, jnp.ones_like(right, bool), none
+    none = jnp.zeros_like(right, bool)
+    start = matrix, right, ~none, none
     _, x, left, negative = lax.fori_loop(0, len(right), eliminate, start)
     return jnp.where(left, 0.0, x), negative

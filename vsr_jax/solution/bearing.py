@@ -6,11 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..elements.contact import Contacts
+from ..elements.nearest import lying
+from ..elements.supports import Supports
+from ..elements.touch import Touch, received
 from ..mechanics.arm_balance import ArmUnknown, state_of
 from ..mechanics.coupling import ArmProblem
-from ..mechanics.held import Holds
-from ..mechanics.nearest import lying
-from ..mechanics.touch import Surroundings, Touch, received
 from ..numerics.quadrature import Grid
 from ..typing import DTypeLike
 
@@ -44,18 +45,17 @@ def no_contact(dtype: DTypeLike) -> Contact:
 
 def supports_of(problem: ArmProblem, unknown: ArmUnknown) -> Float[Array, "supports 6"]:
     """Moment and force in the world frame by which each held section is held."""
-    found = zip(problem.couplings, unknown.coupled, strict=True)
-    return jnp.concatenate([one.wrenches(x) for one, x in found if isinstance(one, Holds)])
+    at = state_of(unknown.xi, unknown.coupled, problem)
+    found = zip(problem.couplings, unknown.coupled, at.notes, strict=True)
+    each = [one.wrenches(x, note) for one, x, note in found if isinstance(one, Supports)]
+    return jnp.concatenate(each)
 
 
 def contacts_of(problem: ArmProblem, unknown: ArmUnknown) -> Contact:
     """The contacts of an arm with obstacles."""
     at, grid = state_of(unknown.xi, unknown.coupled, problem), problem.grid
-    assert at.along is not None
-    assert at.loads is not None
-    touch, around = at.along.touch, at.loads.around
-    assert touch is not None
-    assert around is not None
+    found = zip(problem.couplings, at.notes, strict=True)
+    ((around, touch),) = [(one, note) for one, note in found if isinstance(one, Contacts)]
     friction = jnp.zeros_like(touch.normal) if touch.slip is None else touch.slip.force
     which, pushes, force = _places(touch, around, grid)
     steps = jnp.arange(len(grid.h))[:, None]
@@ -77,7 +77,7 @@ def contacts_of(problem: ArmProblem, unknown: ArmUnknown) -> Contact:
     )
 
 
-def _places(touch: Touch, around: Surroundings, grid: Grid) -> tuple[Array, Array, Array]:
+def _places(touch: Touch, around: Contacts, grid: Grid) -> tuple[Array, Array, Array]:
     """The contacts of a step at its places (obstacles, steps, 1 or 2), whether they are those of
     the places (obstacles, places), and their forces there: an obstacle without a contact at the end
     of a step has the nearest one twice."""

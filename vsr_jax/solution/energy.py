@@ -21,8 +21,9 @@ from jaxtyping import Array
 from ..arm.pose_loads import PoseLoad
 from ..arm.rod import Rod
 from ..arm.scene import Scene
+from ..elements.chords import chords_of
+from ..elements.driven_threads import driven_of
 from ..mechanics.balance import thread_direction
-from ..mechanics.cable import cable_of, chords_of
 from ..models.base import Nodes
 from ..numerics import component as c
 from ..numerics.component import Vector
@@ -100,7 +101,7 @@ def _potential(load: PoseLoad, rod: Rod, X: Array, g: Array) -> Scalar:
 
 def _stretch(scene: Scene, inputs: Array, forces: Vector, nodes: Nodes, place: int) -> Array:
     r"""Energy of a cable's stretch, $\frac{1}{2k} \int T^2 ds$ over its free length."""
-    cable = cable_of(scene, inputs[place], place, nodes.sections, nodes.grid)
+    cable = driven_of(scene, inputs[place], place, nodes.sections, nodes.grid)
     share = nodes.shares[place]
     square = None if share is None else share**2
     return forces[place] ** 2 * cable.stretch(square, nodes.grid) / 2

@@ -9,9 +9,9 @@ from jaxtyping import Array, Bool, Float
 
 from ..arm.discs import on_chords, points_at
 from ..arm.scene import Scene
+from ..elements.driven_threads import driven_of, thread_length
 from ..mechanics.arm_balance import ArmUnknown
 from ..mechanics.balance import forces_where
-from ..mechanics.cable import cable_of, thread_length
 from ..mechanics.coupling import ArmProblem
 from ..mechanics.reaction import react_at
 from ..models.base import Model, Nodes, Outcome, Status
@@ -145,9 +145,9 @@ class Equilibrium(Solved):
         X. The rod and the threads carry it together."""
         nodes = self.nodes
         loads = self.model.loading(self.scene, self.state, nodes.grid)
-        if loads is None or loads.only_discs:
+        loads = None if loads is None else loads.without_threads()
+        if loads is None:
             return jnp.zeros((X.size, 6), X.dtype)
-        loads = loads._replace(discs=None)  # straight tendons are threads, too
         return c.join(react_at(nodes.xi, nodes.grid, loads, X))
 
     @quantity("1")
@@ -228,7 +228,7 @@ class Equilibrium(Solved):
         nodes, scene = self.nodes, self.scene
         slack = jnp.zeros_like(self.inputs)
         for place in scene.length_driven:
-            cable = cable_of(scene, self.inputs[place], place, nodes.sections, nodes.grid)
+            cable = driven_of(scene, self.inputs[place], place, nodes.sections, nodes.grid)
             tension = -self.sound_forces[place]
             path = thread_length(scene, nodes.xi, nodes.sections, place, nodes.grid)
             loose = cable.slack(tension, path, nodes.shares[place], nodes.grid)

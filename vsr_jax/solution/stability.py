@@ -17,12 +17,11 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ..arm.scene import CrossSections, Scene
+from ..elements.chords import chords_of
+from ..elements.problem import loading
 from ..mechanics.arm_balance import ArmUnknown, imbalance_of, state_of
 from ..mechanics.balance import tangent, thread_direction, thread_wrench
-from ..mechanics.cable import chords_of
-from ..mechanics.contact import Contacts
-from ..mechanics.coupling import ArmProblem
-from ..mechanics.loading import loading
+from ..mechanics.coupling import ArmProblem, Constraint
 from ..mechanics.reaction import rotations
 from ..models.base import Nodes
 from ..numerics import component as c, lu, stacked
@@ -149,11 +148,8 @@ def _supported(problem: ArmProblem, unknown: ArmUnknown, free: tuple[int, ...]) 
     at = state_of(unknown.xi, unknown.coupled, problem)
     ties = []
     for coupling, x, note in zip(problem.couplings, unknown.coupled, at.notes, strict=True):
-        if isinstance(coupling, Contacts):
-            points = coupling.points(x, at, note, problem)
-            # friction, of the points behind, does not hold an arm
-            rows = coupling.rows(at, note, problem.grid)
-            corner = points.corner[: coupling.per_step].reshape(-1)
+        if isinstance(coupling, Constraint):
+            rows, corner = coupling.prevents(x, at, note, problem)
         else:
             border = coupling.border(x, at, note, problem)
             if border is None:

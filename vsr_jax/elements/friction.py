@@ -23,14 +23,17 @@ from jax import lax
 from jaxtyping import Array
 
 from ..arm.scene import CrossSections, Scene
-from ..numerics import component as c
-from ..numerics.component import Forces, Vector
-from ..numerics.implicit import at_nodes
-from ..numerics.quadrature import Grid
-from ..numerics.stacked import components
-from .coupling import ArmProblem, ArmState, Carried, Coupling, Shares
-from .sizes import node_weight, pull_of, softest
-from .turning import (
+from ..mechanics.coupling import (
+    ArmProblem,
+    ArmState,
+    Carried,
+    Coupling,
+    Scales,
+    Shares,
+    ThreadRule,
+)
+from ..mechanics.sizes import node_weight, pull_of, softest
+from ..mechanics.turning import (
     balanced_strain_rate,
     breaks_of,
     kinks_of,
@@ -39,6 +42,11 @@ from .turning import (
     turned_at,
     turning_rate,
 )
+from ..numerics import component as c
+from ..numerics.component import Forces, Vector
+from ..numerics.implicit import at_nodes
+from ..numerics.quadrature import Grid
+from ..numerics.stacked import components
 
 
 class Memory(NamedTuple):
@@ -49,7 +57,7 @@ class Memory(NamedTuple):
     slope: Array
 
 
-class Friction(Coupling):
+class Friction(ThreadRule):
     r"""All tendons of an arm with friction. The unknowns are the turning rates $\varphi'$ [rad/m]
     of their paths at the nodes, one array per tendon, and the rows their differences from those of
     the paths.
@@ -203,12 +211,12 @@ class Friction(Coupling):
     def row_sizes(self, rows: Vector, at: ArmState, problem: ArmProblem) -> list[Array]:
         return self.sizes(rows, at, problem)
 
-    def units(self, problem: ArmProblem) -> tuple[Vector, Vector]:
-        turn = jnp.sqrt(node_weight(problem.grid) * softest(problem.sections.stiffness))
-        return (turn,) * len(self.places), (1 / turn,) * len(self.places)
-
-    def radians(self, problem: ArmProblem) -> Vector:
-        return (jnp.sqrt(problem.grid.weight * problem.length),) * len(self.places)
+    def scales(self, problem: ArmProblem) -> Scales:
+        """Rates of a path count as the angles over an arm that bends as fast."""
+        bending = node_weight(problem.grid) * softest(problem.sections.stiffness)
+        length = bending / jnp.sqrt(node_weight(problem.grid) * problem.length)
+        every = len(self.places)
+        return Scales((1 / bending,) * every, (length,) * every)
 
 
 def _rows(

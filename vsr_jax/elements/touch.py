@@ -40,16 +40,16 @@ from jaxtyping import Array
 
 from ..arm.obstacles import Obstacle
 from ..arm.rod import Rod
+from ..mechanics.applied_load import AppliedLoad, Exerted, Pose, starts_of
 from ..numerics.once import once
-from ..numerics.quadrature import Grid, gauss_legendre, integral_weights, value_weights
+from ..numerics.quadrature import gauss_legendre, integral_weights, value_weights
 from ..numerics.stacked import cross, matmul, product, rows, skew, total
 from .nearest import nearest_points
-from .pose_terms import starts_of
 from .slip import Rough, Slip, slip_of
 
 
-class Surroundings(NamedTuple):
-    r"""The obstacles around an arm.
+class Surroundings(AppliedLoad):
+    r"""The obstacles around an arm, and the contact forces.
 
     **Fields:** the `obstacles`, the `rod` and the position of its `base`; `flatness` $\epsilon_0$
     [m]; `lift` [m], added to all gaps alike or to each; `stiffness` [N/m] and `width` [m] of
@@ -67,6 +67,25 @@ class Surroundings(NamedTuple):
     force: Array
     soft: Array | None
     rough: Rough | None = None
+    nearly_rigid = True
+
+    @property
+    def motion(self) -> int:
+        return 6
+
+    def scaled(self, share: Array) -> "Surroundings":
+        """The same: the forces are unknowns."""
+        return self
+
+    def absent(self) -> "Surroundings":
+        return self
+
+    def exerted(self, pose: Pose) -> Exerted:
+        touch = touch_of(pose, self)
+        return Exerted(contact_wrenches(touch), note=touch)
+
+    def within_step(self, exerted: Exerted, step: Array, sigma: Array, *, smooth: bool) -> Array:
+        return exerted.note.carried(step, sigma, smooth)
 
 
 class Touch(NamedTuple):
@@ -164,8 +183,9 @@ class Touch(NamedTuple):
         return jnp.concatenate([cross(self.lever + self.slip.lever, force), force])
 
 
-def touch_of(axis: Array, rotation: Array, grid: Grid, around: Surroundings) -> Touch:
-    """Contact for the axis p' (3, stages, steps, *arms) and the rotations at the nodes."""
+def touch_of(pose: Pose, around: Surroundings) -> Touch:
+    """Contact of an arm in a pose."""
+    axis, rotation, grid = pose.axis, pose.rotation, pose.grid
     starts = starts_of(around.base, axis, grid)
     near = nearest_points(around.obstacles, around.rod, around.flatness, starts, axis, grid)
     # empty steps, all at one place, touch nothing

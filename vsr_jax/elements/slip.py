@@ -26,9 +26,9 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ..mechanics.applied_load import starts_of
 from ..numerics.quadrature import Grid
 from ..numerics.stacked import cross, matmul, matvec, transpose
-from .pose_terms import starts_of
 
 _AT_LIMIT = 1 - 1e-6
 """Share of Coulomb's limit from which a contact slips: one that slipped before is at the limit, but

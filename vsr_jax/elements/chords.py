@@ -27,51 +27,69 @@ import numpy as np
 from jaxtyping import Array
 
 from ..arm.discs import steps_before
-from ..arm.scene import CrossSections, Scene
-from ..numerics.component import Forces, Vector
+from ..arm.scene import Scene
+from ..mechanics.applied_load import AppliedLoad, Exerted, Loading, Pose, Slopes
+from ..mechanics.reaction import react
+from ..numerics.component import Vector
 from ..numerics.quadrature import Grid, collocation, weighted
 from ..numerics.stacked import components, cross, dot, identity, transpose, turned
 
 
-class Discs(eqx.Module):
+class Discs(AppliedLoad):
     """All straight tendons of an arm on a grid, their holes one after another.
 
-    - `places`: their places among the threads. `sizes`: the number of holes of each.
+    - `places`: their places among the threads. `hole_counts`: the number of holes of each.
     - `at`: shape (holes, steps + 1), 1 where a hole lies among the starts of the steps and the tip.
     - `before`: shape (holes, steps), 1 for the steps before each hole.
     - `y`, `z`: where the holes cross their sections [m], shape (holes,).
     """
 
     places: tuple[int, ...] = eqx.field(static=True)
-    sizes: tuple[int, ...] = eqx.field(static=True)
+    hole_counts: tuple[int, ...] = eqx.field(static=True)
     at: Array
     before: Array
     y: Array
     z: Array
+    local = True
+
+    @property
+    def motion(self) -> int:
+        return 3
+
+    @property
+    def threads(self) -> tuple[int, ...]:
+        return self.places
+
+    def scaled(self, share: Array) -> "Discs":
+        """The same: it is the forces of the tendons that come by increments, not their way."""
+        return self
+
+    def absent(self) -> "Discs":
+        return self
+
+    def exerted(self, pose: Pose) -> Exerted:
+        pull = pull_of(self, pose)
+        return Exerted(levered=pull.wrench, note=pull)
+
+    def slopes(self, pose: Pose, exerted: Exerted, size: int, *, alone: bool) -> Slopes:
+        pull: Pull = exerted.note
+        if alone:
+            return Slopes(ends=pull.cut_slopes(size), joined=pull.joined)
+        return Slopes(ends=pull.slopes(size))
+
+    def spans(self, pose: Pose, exerted: Exerted, *, alone: bool) -> Vector:
+        return exerted.note.springs(pose.rotation, cut=alone)
 
     @property
     def first(self) -> np.ndarray:
         """Index of the first hole of each chord."""
-        last = np.cumsum(self.sizes) - 1
+        last = np.cumsum(self.hole_counts) - 1
         return np.setdiff1d(np.arange(last[-1]), last)
 
     @property
     def owner(self) -> np.ndarray:
         """For each chord the index of its tendon among the straight ones."""
-        return np.repeat(np.arange(len(self.sizes)), np.array(self.sizes) - 1)
-
-    def elsewhere(self, tau: Forces) -> Forces:
-        """Forces at the nodes of the threads that run along the sections: zero for straight
-        tendons, whose wrench is a part of the reaction."""
-        return tuple(
-            jnp.zeros_like(force) if i in self.places else force for i, force in enumerate(tau)
-        )
-
-    def beside(self, sections: CrossSections) -> CrossSections:
-        """The sections with straight tendons that reach no node."""
-        none = jnp.zeros_like(sections.rest[0])
-        reach = enumerate(sections.reach)
-        return sections._replace(reach=tuple(none if i in self.places else x for i, x in reach))
+        return np.repeat(np.arange(len(self.hole_counts)), np.array(self.hole_counts) - 1)
 
 
 class Chords(NamedTuple):
@@ -210,15 +228,10 @@ def discs_of(scene: Scene, grid: Grid) -> Discs | None:
     return Discs(places, sizes, at.astype(dtype), before.astype(dtype), y, z)
 
 
-def pull_of(
-    discs: Discs, starts: Array, end: Array, axis: Array, grid: Grid, forces: Forces
-) -> Pull:
-    """The chords of an arm, and their forces.
-
-    **Arguments:** rotations at the `starts` of the steps (3, 3, steps) and at the `end` of the arm;
-    its `axis` $p'$ at the nodes; the `forces` of all threads at their start.
-    """
-    R = jnp.concatenate([starts, end[:, :, None]], axis=2)
+def pull_of(discs: Discs, pose: Pose) -> Pull:
+    """The chords of an arm, and their forces."""
+    grid, axis = pose.grid, pose.axis
+    R = jnp.concatenate([pose.starts, pose.end[:, :, None]], axis=2)
     run = jnp.sum(grid.weight * axis, axis=1)
     r = jnp.cumsum(jnp.concatenate([jnp.zeros_like(run[:, :1]), run], axis=1), axis=1)
     here = jnp.sum(discs.at * R[:, 1:, None], axis=3)
@@ -230,5 +243,22 @@ def pull_of(
     direction = chord / length
     since = weighted(collocation(axis.shape[1]), grid.h * axis, axis=1)
     lever = p[:, first][:, :, None, None] - r[:, None, None, :-1] - since[:, None]
-    tau = jnp.stack(jnp.broadcast_arrays(*(forces[place] for place in discs.places)))
+    tau = jnp.stack(jnp.broadcast_arrays(*(pose.forces[place] for place in discs.places)))
     return Pull(discs, Chords(lever, direction, length, arms), tau[discs.owner] * direction)
+
+
+def pull_on(exerted: tuple[Exerted, ...], place: int) -> Pull | None:
+    """The chords that a thread runs along, of what all loads exert; None where it runs along its
+    path."""
+    for one in exerted:
+        if isinstance(one.note, Pull) and place in one.note.discs.places:
+            return one.note
+    return None
+
+
+def chords_of(scene: Scene, xi: Vector, grid: Grid) -> Pull:
+    """The chords of the straight tendons of a scene without their forces."""
+    discs = discs_of(scene, grid)
+    assert discs is not None  # see `Scene.straight`
+    forces = (jnp.zeros_like(scene.rod.length),) * len(scene.actuators)
+    return react(xi, grid, Loading((discs,), scene.rod.frame), forces).exerted[0].note

@@ -40,21 +40,40 @@ from jaxtyping import Array, PyTree
 
 from ..arm.obstacles import Obstacle
 from ..arm.rod import Rod
+from ..arm.scene import CrossSections, Scene
+from ..mechanics.applied_load import Exerted, finite
+from ..mechanics.coupling import SOFTENED, ArmProblem, ArmState, Constraint, Coupling, Scales
+from ..mechanics.sizes import softest
 from ..numerics.component import Forces, Vector
 from ..numerics.damped_rules import HARDENING_STAGES, SOFT_STAGES
 from ..numerics.quadrature import Grid, locate
 from ..numerics.se3 import base_pose, stacked_rotation
-from .coupling import SOFTENED, ArmProblem, ArmState, Coupling
-from .held import of_forces
-from .loading import Loading
+from ..typing import DTypeLike
+from .contact_tangent import ContactSprings, sliding_of
 from .nearest import lying
-from .point_forces import PointForces
-from .pose_terms import finite
 from .slip import Rough, Traces, moved_to
+from .supports import of_forces
 from .touch import Surroundings, Touch
 
-LAST = 1e-9, 1e-10
+_LAST = 1e-9, 1e-10
 """Length b, as a fraction of the arm's, and compliance c in the end."""
+
+_FIRST = 0.1, 2e-2
+"""Length b, as a fraction of the arm's, and compliance c to begin with."""
+
+_ROOMY = 0.3
+"""Room between arm and wall, as a fraction of the arm's length, below which both are smaller from
+the start."""
+
+_FLATNESS = 1e-3
+"""Bound on the excess of the gap at the nearest point of a step over the least one, as a fraction
+of the outline."""
+
+_GRIP = 10.0
+"""Stiffness c of `slip`, in units of that of the arm up to the contact."""
+
+_AT_HELD = 1e-6
+"""Distance of a held section from the end of a step that is at it, as a fraction of the length."""
 
 _RIGID = 2 / 3
 """Power of the machine epsilon that is the least compliance of a contact in the approximate
@@ -76,7 +95,7 @@ _FLATTER = 0.1
 of the length b."""
 
 
-class Contacts(Coupling):
+class Contacts(Constraint):
     """All contacts of an arm; the unknowns are their forces [N], shape (per_step * steps, ...), and
     with friction a pair, the second (3, per_step * steps, ...) the friction [N] in the world.
 
@@ -103,7 +122,6 @@ class Contacts(Coupling):
     grip: Array | None = None
     soft: Array | None = None
     traces: Traces | None = None
-    softens = True
     begins_soft = True
 
     @property
@@ -118,18 +136,15 @@ class Contacts(Coupling):
     def loosened(self, loose: Array) -> "Contacts":
         return replace(self, loose=jnp.maximum(self.loose, loose.astype(self.loose.dtype)))
 
-    def was_loosened(self, loose: Array) -> Array:
-        return loose | (self.loose > 0)
-
-    def as_loose_as(self, other: Coupling) -> "Contacts":
-        return self.loosened(other.loose) if isinstance(other, Contacts) else self
+    @property
+    def looseness(self) -> Array:
+        return self.loose
 
     def softened(self, hardness: Array) -> "Contacts":
         of, length = self.scale.dtype, self.rod.length
         roughness = jnp.clip((hardness - _SMOOTH) / (1 - _SMOOTH), 0.0, 1.0)
-        blur, give = (
-            first * (last / first) ** hardness for first, last in zip(self.first, LAST, strict=True)
-        )
+        ends = zip(self.first, _LAST, strict=True)
+        blur, give = (first * (last / first) ** hardness for first, last in ends)
         return replace(
             self,
             soft=(hardness < SOFTENED).astype(of),
@@ -163,8 +178,7 @@ class Contacts(Coupling):
         force = jnp.zeros((self.per_step * self.steps, *grid.h.shape[1:]), grid.h.dtype)
         return force if self.friction is None else (force, jnp.stack([force] * 3))
 
-    def loads(self, x: PyTree, loads: Loading | None) -> Loading | None:
-        assert loads is not None
+    def exerts(self, x: PyTree) -> tuple[Surroundings]:
         around = Surroundings(
             self.obstacles,
             self.rod,
@@ -177,7 +191,7 @@ class Contacts(Coupling):
             self.soft,
             self._rough(x),
         )
-        return loads._replace(around=around)
+        return (around,)
 
     def _flatness(self) -> Array:
         """Bulge of a gap that counts as flat: if loosened that of the curvature 1 / L."""
@@ -205,19 +219,19 @@ class Contacts(Coupling):
     def after(self, x: PyTree, at: ArmState, problem: ArmProblem) -> "Contacts":
         if self.friction is None:
             return self
-        assert at.along is not None
-        return replace(self, traces=Traces(self.base, at.along.axis, at.along.rotation))
+        assert at.along is not None  # a scene with obstacles reacts
+        pose = at.along.pose
+        return replace(self, traces=Traces(self.base, pose.axis, pose.rotation))
 
     def remembering(self, other: Coupling, X: Array, grid: Grid) -> "Contacts":
         assert isinstance(other, Contacts)
         traces = None if other.traces is None else moved_to(other.traces, X, grid)
-        return replace(self.as_loose_as(other), traces=traces)
+        return replace(self.loosened(other.loose > 0), traces=traces)
 
-    def note(self, x: PyTree, at: ArmState, problem: ArmProblem) -> Touch:
+    def note(self, x: PyTree, at: ArmState, own: tuple[Exerted, ...], problem: ArmProblem) -> Touch:
         """The contacts."""
-        assert at.along is not None
-        assert at.along.touch is not None
-        return at.along.touch
+        (around,) = own
+        return around.note
 
     def residual(
         self, x: PyTree, at: ArmState, note: Touch, problem: ArmProblem, free: tuple[int, ...]
@@ -233,16 +247,22 @@ class Contacts(Coupling):
             return rows
         return rows, x[1] if note.slip is None else note.slip.row.reshape(x[1].shape)
 
-    def points(self, x: PyTree, at: ArmState, note: Touch, problem: ArmProblem) -> PointForces:
+    def springs(
+        self, x: PyTree, at: ArmState, note: Touch, problem: ArmProblem, free: tuple[int, ...]
+    ) -> ContactSprings:
         pushed = self.scale * note.gap + self.give * note.force
         _, by_gap = self._smooth_minimum(note.force, pushed)
-        free = 1 - jnp.abs(note.handed)
-        free = free if self.soft is None else (1 - self.soft) * free
-        pushing = free * by_gap
-        least = float(jnp.finfo(free.dtype).eps) ** _RIGID
-        normal = PointForces(
-            free * note.per_force,
-            free * note.direction,
+        own = 1 - jnp.abs(note.handed)
+        own = own if self.soft is None else (1 - self.soft) * own
+        pushing = own * by_gap
+        least = float(jnp.finfo(own.dtype).eps) ** _RIGID
+        assert at.along is not None  # a scene with obstacles reacts
+        touch, sliding = sliding_of(note, at.along.pose, problem, free)
+        normal = ContactSprings(
+            touch,
+            sliding,
+            own * note.per_force,
+            own * note.direction,
             note.cell,
             note.part,
             pushing * self.scale,
@@ -254,17 +274,20 @@ class Contacts(Coupling):
         assert self.grip is not None
         return _with_slip(normal, note, self.grip, least * self.grip / self.scale)
 
-    def rows(self, at: ArmState, note: Touch, grid: Grid) -> Vector:
-        """For each contact of one arm the wrenches at the nodes whose work over a change of strain
-        is the change of its gap: six components, (contacts, stages, steps)."""
+    def prevents(
+        self, x: PyTree, at: ArmState, note: Touch, problem: ArmProblem
+    ) -> tuple[Vector, Array]:
+        """Of one arm: friction does not hold it."""
         assert at.along is not None
+        springs = self.springs(x, at, note, problem, ())
         steps = jnp.arange(self.steps)
         here, before = jnp.eye(self.steps), steps < steps[:, None]
         shares = jnp.where(here > 0, note.shares[..., None], before)  # (stages, obstacles, of, in)
         force = shares[None] * note.normal[:, None, ..., None]
         world = jnp.concatenate([jnp.zeros_like(force), force])
         world = jnp.moveaxis(world, (2, 3), (0, 1)).reshape(-1, *world.shape[:2], self.steps)
-        return of_forces(world, at.along, grid)
+        wrenches = of_forces(world, at.along, problem.grid)
+        return wrenches, springs.corner[: self.per_step].reshape(-1)
 
     def clear(self, at: ArmState, note: Touch, problem: ArmProblem) -> Array:
         """Whether all forces together bend the arm by much less than the least gap."""
@@ -297,38 +320,26 @@ class Contacts(Coupling):
         smooth = jnp.where(total > 0, excess / whole, 0.5 * (total - root))
         return smooth, 0.5 * (1 + apart / jnp.where(inside, total, root))
 
-    def sizes(self, x: PyTree, at: ArmState, problem: ArmProblem) -> list[Array]:
-        return [force / (self.scale * problem.length) for force in jax.tree.leaves(x)]
-
-    def row_sizes(self, rows: PyTree, at: ArmState, problem: ArmProblem) -> list[Array]:
-        """Gaps and deflections by forces, per length of the arm."""
-        return self.sizes(rows, at, problem)
-
-    def units(self, problem: ArmProblem) -> tuple[PyTree, PyTree]:
-        root = jnp.sqrt(self.scale)
-        row, change = 1 / root, root
-        return (row, change) if self.friction is None else ((row, row), (change, change))
-
-    def radians(self, problem: ArmProblem) -> PyTree:
-        like = self.guess((), problem.grid)
-        return jax.tree.map(lambda x: x + 1 / (self.scale * problem.length), like)
+    def scales(self, problem: ArmProblem) -> Scales:
+        if self.friction is None:
+            return Scales(self.scale, problem.length)
+        return Scales((self.scale,) * 2, (problem.length,) * 2)
 
 
-def _with_slip(normal: PointForces, touch: Touch, grip: Array, least: Array) -> PointForces:
+def _with_slip(normal: ContactSprings, touch: Touch, grip: Array, least: Array) -> ContactSprings:
     """Contact forces with friction in two directions of each contact."""
     slip = touch.slip
     assert slip is not None
     kept, tangents = jnp.concatenate(slip.kept), touch.tangents
-
-    return PointForces(
-        jnp.concatenate([normal.wrench, tangents], axis=1),
-        jnp.concatenate([normal.direction, touch.slips], axis=1),
-        jnp.concatenate([normal.cell] * 3, axis=1),
-        jnp.concatenate([normal.part] * 3),
-        jnp.concatenate([normal.factors, kept * grip]),
-        jnp.concatenate([normal.corner, jnp.maximum(1 - kept, least)]),
-        jnp.concatenate([normal.handed, jnp.zeros_like(kept)]),
-        slip,
+    return normal._replace(
+        wrench=jnp.concatenate([normal.wrench, tangents], axis=1),
+        direction=jnp.concatenate([normal.direction, touch.slips], axis=1),
+        cell=jnp.concatenate([normal.cell] * 3, axis=1),
+        part=jnp.concatenate([normal.part] * 3),
+        factors=jnp.concatenate([normal.factors, kept * grip]),
+        corner=jnp.concatenate([normal.corner, jnp.maximum(1 - kept, least)]),
+        handed=jnp.concatenate([normal.handed, jnp.zeros_like(kept)]),
+        slip=slip,
     )
 
 
@@ -349,3 +360,68 @@ def _bending_along(obstacle: Obstacle, base: Array | None, h: Array) -> Array | 
         return stacked_rotation(vector) @ R, k[1:]
 
     return lax.scan(turn, pose[:3, :3], (ahead, h))[1].T
+
+
+def contacts_of(scene: Scene, sections: CrossSections, grid: Grid) -> Contacts | None:
+    """The contacts of a scene; None if it has no obstacles."""
+    if not scene.obstacles:
+        return None
+    base = jnp.asarray(base_pose(scene.rod.base, grid.h.dtype))[:3, 3]
+    length = jnp.sum(grid.h)
+    bending = jnp.sum(grid.weight * softest(sections.stiffness)) / length
+    flatness = _FLATNESS * scene.rod.outline(0.5 * scene.rod.length)
+    stiffness, friction = 3 * bending / length**3, _friction(scene.obstacles, grid.h.dtype)
+    ends = jnp.maximum(jnp.cumsum(grid.h, axis=0), grid.h[:1])
+    return Contacts(
+        scene.obstacles,
+        scene.rod,
+        base,
+        stiffness,
+        flatness,
+        _lift(scene, grid),
+        _LAST[0] * length,
+        jnp.full_like(length, _LAST[1]),
+        _first(scene, length),
+        jnp.zeros_like(length),
+        grid.h.shape[0],
+        friction,
+        None if friction is None else _GRIP * stiffness * (length / ends) ** 3,
+    )
+
+
+def _lift(scene: Scene, grid: Grid) -> Array:
+    """What is added to the gaps: the end of a step that is held in its place need not touch what it
+    may be held on."""
+    length, ends = jnp.sum(grid.h), lying(scene.obstacles)
+    held = [held.place(scene.rod) for held in scene.held if held.fixed]
+    if not ends or not held:
+        return jnp.zeros_like(length)
+    apart = jnp.abs(grid.start + grid.h - jnp.stack(held).reshape(-1, 1))
+    there = jnp.any(apart < _AT_HELD * length, axis=0).astype(length.dtype)
+    nearest = jnp.zeros((len(scene.obstacles), len(there)), length.dtype)
+    return 1e3 * length * jnp.concatenate([nearest, jnp.stack([there] * len(ends))])
+
+
+def _friction(obstacles: tuple[Obstacle, ...], dtype: DTypeLike) -> Array | None:
+    """Coefficients of friction of the contacts of a step; None if no obstacle has any."""
+    if all(obstacle.friction is None for obstacle in obstacles):
+        return None
+    each = [0.0 if obstacle.friction is None else obstacle.friction for obstacle in obstacles]
+    each += [0.0] * len(lying(obstacles))
+    return jnp.stack([jnp.asarray(x, dtype) for x in each])
+
+
+def _first(scene: Scene, length: Array) -> Array:
+    """Length b, as a fraction of the arm's, and compliance c to begin with: smaller where a lumen
+    leaves the arm little room."""
+    blur, give = (jnp.full_like(length, x) for x in _FIRST)
+    for obstacle in scene.obstacles:
+        room = obstacle.room
+        if room is not None:
+            room = (room - scene.rod.outline(0.5 * scene.rod.length)) / length
+            narrow = jnp.clip(room / _ROOMY, 1e-3, 1.0).astype(length.dtype)
+            blur, give = (
+                jnp.minimum(blur, narrow * _FIRST[0]),
+                jnp.minimum(give, narrow * _FIRST[1]),
+            )
+    return jnp.stack([blur, give])
