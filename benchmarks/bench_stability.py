@@ -84,7 +84,7 @@ def main() -> None:
         return eqx.filter(vsr.solve(scene, inputs, model=model), eqx.is_array)
 
     def margin(eq: Equilibrium) -> Any:
-        return extreme(eq.scene, eq.sound_forces, eq.nodes)
+        return extreme(eq.scene, eq.inputs, eq.sound_forces, eq.nodes)
 
     def slope(scene: vsr.Scene, inputs: jax.Array) -> Any:
         return jax.grad(lambda inputs: vsr.solve(scene, inputs, model=model).stability)(inputs)

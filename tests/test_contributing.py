@@ -17,7 +17,9 @@ MOST_LINES = 30
 HEADINGS = [
     "A load",
     "A load that depends on the pose",
+    "A support",
     "An obstacle",
+    "An actuator",
     "A section law",
     "A routing",
     "A basis",

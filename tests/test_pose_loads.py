@@ -272,7 +272,7 @@ def test_the_form_of_the_tangent_is_its_product(everything):
 
     @eqx.filter_jit
     def form_and_product(eq, free):
-        arm = arm_of(eq.scene, eq.sound_forces, eq.nodes)
+        arm = arm_of(eq.scene, eq.inputs, eq.sound_forces, eq.nodes)
         return arm.form(free / arm.units), jnp.sum(
             free / arm.units * arm.product()(free / arm.units)
         )

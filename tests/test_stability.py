@@ -139,7 +139,7 @@ def test_the_ends_of_the_spectrum_are_those_of_the_dense_tangent(name):
 
     @eqx.filter_jit
     def found(scene, forces, nodes):
-        operator = arm_of(scene, forces, nodes)
+        operator = arm_of(scene, jnp.zeros(len(forces)), forces, nodes)
         pairs = extreme_pairs(operator)
         products = jax.vmap(operator.product())(pairs.vectors)
         return pairs, products, jax.vmap(operator.allowed)(pairs.vectors)
@@ -162,7 +162,8 @@ def margin(p):
         lambda scene: scene.loads[1].force, scene, scene.loads[1].force * p[1]
     ).astype(p.dtype)
     nodes = bent(scene, p[0], vsr.StrainDependent(12, 2))
-    return extreme(scene, tuple(jnp.asarray(f, p.dtype) * p[2] for f in forces), nodes)
+    pulls = tuple(jnp.asarray(f, p.dtype) * p[2] for f in forces)
+    return extreme(scene, jnp.zeros(len(pulls)), pulls, nodes)
 
 
 POINT = np.array([1.0, 2.0, 1.5])
@@ -307,6 +308,7 @@ def test_an_arm_without_loads_is_judged_section_by_section():
     steadies every section."""
     given, held = (arm([], control=control) for control in ("tension", "length"))
     forces = tuple(jnp.asarray(f) for f in (-1.0, -2.0))
-    values = [eqx.filter_jit(extreme)(scene, forces, bent(scene)) for scene in (given, held)]
+    none = jnp.zeros(2)
+    values = [eqx.filter_jit(extreme)(scene, none, forces, bent(scene)) for scene in (given, held)]
     np.testing.assert_allclose(*values, rtol=1e-14)
     assert values[0] > 1 - 1e-12

@@ -192,8 +192,8 @@ class _Sizes(NamedTuple):
         moved = self.turn(step.q)
         for coupling, x in zip(self.problem.couplings, step.coupled, strict=True):
             if x is not None:
-                sizes = coupling.sizes(x, at, self.problem)
-                moved = sum((jnp.max(jnp.abs(size), axis=(0, 1)) for size in sizes), moved)
+                for size in coupling.sizes(x, at, self.problem):
+                    moved = moved + jnp.max(jnp.abs(size), axis=self._inner(size))
         return moved
 
     def of_imbalance(self, r: GalerkinUnknown, at: ArmState) -> Array:
@@ -201,9 +201,13 @@ class _Sizes(NamedTuple):
         square = self.turn(lu.substitute(self.factors, r.q)) ** 2
         for coupling, rows in zip(self.problem.couplings, r.coupled, strict=True):
             if rows is not None:
-                sizes = coupling.row_sizes(rows, at, self.problem)
-                square = sum((size**2 for size in sizes), square)
+                for size in coupling.row_sizes(rows, at, self.problem):
+                    square = square + jnp.sum(size**2, axis=self._inner(size))
         return jnp.sqrt(square)
+
+    def _inner(self, x: Array) -> tuple[int, ...]:
+        """The axes in front of those of the arms."""
+        return tuple(range(x.ndim - self.problem.grid.h.ndim + 1))
 
 
 def _sizes_of(basis: NodalBasis, K: Array, problem: ArmProblem) -> _Sizes:

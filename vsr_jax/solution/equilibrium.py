@@ -309,7 +309,8 @@ class Equilibrium(Solved):
     def _extreme(self, *, greatest: bool) -> Scalar:
         if self.scene.held or self.scene.obstacles:
             return extreme_supported(*self._balance, self.scene.free, greatest=greatest)
-        return extreme(self.scene, self.sound_forces, self.nodes, greatest=greatest)
+        forces = self.sound_forces
+        return extreme(self.scene, self.inputs, forces, self.nodes, greatest=greatest)
 
     def _ends(self, index: int) -> tuple[Any, Any]:
         """Abscissas [m] of the start and the end of a thread."""

@@ -3,7 +3,8 @@ the least is the stability margin.
 
 The tangent is the derivative of the discrete residual (see `mechanics.arm_balance`), where the
 wrenches of supports and contacts keep their sizes, restricted to the changes of strain that held
-sections, contacts and taut cables allow.
+sections, contacts and taut cables allow. Threads whose force gives way with their length are
+springs, $\partial \tau / \partial l \, w w^T$ with the wrench w of a unit force.
 """
 
 from collections.abc import Callable
@@ -18,6 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..arm.scene import CrossSections, Scene
 from ..elements.chords import chords_of
+from ..elements.driven_threads import driven_of, thread_length
 from ..elements.problem import loading
 from ..mechanics.arm_balance import ArmUnknown, imbalance_of, state_of
 from ..mechanics.balance import tangent, thread_direction, thread_wrench
@@ -42,16 +44,18 @@ def extreme_supported(
     return _extreme(_supported(problem, unknown, free), -1 if greatest else 0)
 
 
-def extreme(scene: Scene, forces: Vector, nodes: Nodes, *, greatest: bool = False) -> Array:
+def extreme(
+    scene: Scene, inputs: Array, forces: Vector, nodes: Nodes, *, greatest: bool = False
+) -> Array:
     r"""Least or greatest eigenvalue of $\Sigma^{-1/2} H \Sigma^{-1/2}$: node by node without loads,
-    of the whole arm with loads or straight tendons.
+    of the whole arm with loads, straight tendons or laws of actuators.
 
     For the whole arm it is that of the symmetric part of the whole tangent, restricted to the
     changes of strain that the taut cables allow; NaN if the Lanczos method does not converge.
     Otherwise cables are ignored: a finite number of them cannot stiffen every section.
     """
-    if scene.reacts:
-        return _extreme(arm_of(scene, forces, nodes), -1 if greatest else 0)
+    if scene.reacts or _yielding(scene):
+        return _extreme(arm_of(scene, inputs, forces, nodes), -1 if greatest else 0)
     lower = free_block(tangent(nodes.xi, nodes.sections, nodes.tau(forces)), scene.free)
     root = jnp.sqrt(c.join(free_components(nodes.sections.stiffness, scene.free)))
     values = jnp.linalg.eigvalsh(
@@ -71,7 +75,9 @@ class ScaledTangent(Operator):
 
     **Fields:** `problem` and `unknown`: the arm and its solution; `units` scales changes of the
     free strains, $\Sigma^{-1/2} W^{-1/2}$; `ties`: the scaled changes that held sections, contacts
-    and taut cables prevent, rows C, and `share`, $(C C^T)^{-1} C$.
+    and taut cables prevent, rows C, and `share`, $(C C^T)^{-1} C$; `springs`: the scaled wrenches
+    of threads that are springs, times the roots of the sizes of their stiffnesses, and the `signs`
+    of these.
     """
 
     problem: ArmProblem
@@ -79,6 +85,8 @@ class ScaledTangent(Operator):
     units: Float[Array, "strains stages steps"]
     ties: Float[Array, "ties changes"]
     share: Float[Array, "ties changes"]
+    springs: Float[Array, "springs changes"]
+    signs: Float[Array, " springs"]
     free: tuple[int, ...] = eqx.field(static=True)
 
     @property
@@ -97,14 +105,21 @@ class ScaledTangent(Operator):
 
         def times(v: Array) -> Array:
             v = self.allowed(v)
-            return self.allowed(0.5 * (change(v) + back(v)[0]))
+            return self.allowed(0.5 * (change(v) + back(v)[0]) + self._sprung(v))
 
         return times
 
     def form(self, v: Array) -> Array:
         """$v^T S v$ with S the scaled tangent."""
         v = self.allowed(v)
-        return jnp.sum(v * jax.jvp(self._imbalance, (jnp.zeros_like(v),), (v,))[1])
+        change = jax.jvp(self._imbalance, (jnp.zeros_like(v),), (v,))[1] + self._sprung(v)
+        return jnp.sum(v * change)
+
+    def _sprung(self, v: Array) -> Array:
+        """Product with the springs."""
+        if not len(self.springs):
+            return jnp.zeros_like(v)
+        return (self.springs.T @ (self.signs * (self.springs @ v.reshape(-1)))).reshape(v.shape)
 
     def _imbalance(self, v: Array) -> Array:
         """The scaled residual after a scaled change of strain."""
@@ -127,26 +142,38 @@ def _extreme_jvp(place: int, primals: tuple, tangents: tuple) -> tuple[Array, Ar
     return values[place], change_of(lambda arm: arm.form(vectors[place]), primals, tangents)
 
 
-def arm_of(scene: Scene, forces: Vector, nodes: Nodes) -> ScaledTangent:
+def arm_of(scene: Scene, inputs: Array, forces: Vector, nodes: Nodes) -> ScaledTangent:
     """The scaled tangent of an arm under loads, at a solution or at any other strain, for thread
-    forces and their shares along the arm that do not change."""
+    forces that change with lengths alone, and their shares along the arm."""
     sections, grid = nodes.sections._replace(reach=nodes.shares), nodes.grid
     xi = tuple(jnp.broadcast_to(x, grid.X.shape) for x in nodes.xi)
     problem = ArmProblem(grid, sections, forces, loading(scene, grid), ())
     units = _units_of(sections, grid)
-    ties = []
-    for place in scene.length_driven:
+    ties, springs, scale = [], [], grid.weight * units
+    for place in scene.law_driven:
         wrench = _unit_wrench(scene, xi, nodes, place)
         row = tuple(jnp.broadcast_to(x, (1, *grid.X.shape)) for x in wrench)
-        ties.append(_ties(row, forces[place][None] < 0, grid.weight * units, scene.free))
-    return _tied(problem, ArmUnknown(xi, ()), units, ties, scene.free)
+        if place in scene.length_driven:
+            ties.append(_ties(row, forces[place][None] < 0, scale, scene.free))
+        else:
+            thread = driven_of(scene, inputs[place], place, sections, grid)
+            length = thread_length(scene, xi, sections, place, grid)
+            law = thread.law(-forces[place], length, nodes.shares[place], grid)
+            stiffness = -law.by_length / law.by_tension
+            springs.append(_springs(row, stiffness[None], scale, scene.free))
+    return _tied(problem, ArmUnknown(xi, ()), units, ties, springs, scene.free)
+
+
+def _yielding(scene: Scene) -> bool:
+    """Whether the force of a thread gives way with its length."""
+    return len(scene.law_driven) > len(scene.length_driven)
 
 
 def _supported(problem: ArmProblem, unknown: ArmUnknown, free: tuple[int, ...]) -> ScaledTangent:
     """The scaled tangent of a solution with what holds the arm."""
     units = _units_of(problem.sections, problem.grid)
     at = state_of(unknown.xi, unknown.coupled, problem)
-    ties = []
+    ties, springs, scale = [], [], problem.grid.weight * units
     for coupling, x, note in zip(problem.couplings, unknown.coupled, at.notes, strict=True):
         if isinstance(coupling, Constraint):
             rows, corner = coupling.prevents(x, at, note, problem)
@@ -155,8 +182,11 @@ def _supported(problem: ArmProblem, unknown: ArmUnknown, free: tuple[int, ...]) 
             if border is None:
                 continue
             rows, corner = border.rows, border.corner
-        ties.append(_ties(rows, corner < _HOLDING, problem.grid.weight * units, free))
-    return _tied(problem, unknown, units, ties, free)
+            gives = corner >= _HOLDING
+            stiffness = jnp.where(gives, -border.factors / jnp.where(gives, corner, 1.0), 0.0)
+            springs.append(_springs(rows, stiffness, scale, free))
+        ties.append(_ties(rows, corner < _HOLDING, scale, free))
+    return _tied(problem, unknown, units, ties, springs, free)
 
 
 def _tied(
@@ -164,13 +194,17 @@ def _tied(
     unknown: ArmUnknown,
     units: Array,
     ties: list[Array],
+    springs: list[tuple[Array, Array]],
     free: tuple[int, ...],
 ) -> ScaledTangent:
-    """The scaled tangent from the units of all strains and the ties."""
+    """The scaled tangent from the units of all strains, the ties and the springs."""
     units = units[np.asarray(free)]
-    tied = jnp.concatenate([jnp.zeros((0, units.size), units.dtype), *ties])
+    none = jnp.zeros((0, units.size), units.dtype)
+    tied = jnp.concatenate([none, *ties])
     share = _shares(tied) if ties else tied
-    return ScaledTangent(problem, unknown, units, tied, share, free)
+    wrenches = jnp.concatenate([none, *(wrench for wrench, _ in springs)])
+    signs = jnp.concatenate([none[:, 0], *(sign for _, sign in springs)])
+    return ScaledTangent(problem, unknown, units, tied, share, wrenches, signs, free)
 
 
 def _unit_wrench(scene: Scene, xi: Vector, nodes: Nodes, place: int) -> Vector:
@@ -206,6 +240,17 @@ def _ties(
     )
     holds &= size > jnp.sqrt(jnp.finfo(size.dtype).eps) * whole
     return jnp.where(holds, 1 / jnp.where(holds, size, 1.0), 0.0)[:, None] * row
+
+
+def _springs(
+    rows: Vector, stiffness: Array, scale: Array, free: tuple[int, ...]
+) -> tuple[Float[Array, "springs changes"], Float[Array, " springs"]]:
+    """Scaled wrenches of springs, times the roots of the sizes of their stiffnesses, and the signs
+    of these."""
+    row = (jnp.stack(rows, axis=1) * scale)[:, np.asarray(free)].reshape(len(stiffness), -1)
+    there = stiffness != 0  # the root has no derivative at zero
+    root = jnp.where(there, jnp.sqrt(jnp.abs(jnp.where(there, stiffness, 1.0))), 0.0)
+    return root[:, None] * row, jnp.sign(stiffness)
 
 
 def _shares(ties: Array) -> Array:
