@@ -27,7 +27,7 @@ from ..elements.problem import problem_of
 from ..mechanics.arm_balance import ArmSolution, ArmUnknown, imbalance_of, state_of
 from ..mechanics.balance import with_locked
 from ..mechanics.coupling import ArmProblem, forces_at
-from ..models.base import Outcome, Status, resolved
+from ..models.base import Outcome, Status, SteppedModel, resolved
 from ..models.strain_dependent import StrainDependent
 from ..numerics.compiling import program
 from ..numerics.component import add, free_components, multiply, spread, subtract
@@ -84,7 +84,7 @@ def follow_branch(
     scene: SceneOrPath,
     path: InputPath,
     *,
-    model: StrainDependent | None = None,
+    model: SteppedModel | None = None,
     points: int = 100,
     step: float = 0.1,
 ) -> Branch:
@@ -114,12 +114,10 @@ def follow_branch(
     **Raises:** `ValueError` for another model, and the errors of `solve` at s = 0.
     """
     model = StrainDependent(12) if model is None else model
-    instance(
-        "model",
-        model,
-        StrainDependent,
-        "a StrainDependent, the only model whose branches can be followed",
-    )
+    if not (isinstance(model, SteppedModel) and model.on_nodes):
+        raise ValueError(
+            f"model: got {model!r}, need a StrainDependent, whose branches can be followed"
+        )
     count("points", points, least=2)
     numbers("step", step, positive=True)
     start = solve(*lax.stop_gradient(_at(scene, path, jnp.zeros(()))), model=model)
@@ -143,7 +141,7 @@ class _System(NamedTuple):
 
     scene: SceneOrPath
     path: InputPath
-    model: StrainDependent
+    model: SteppedModel
     scale: Array
 
     def problem(self, s: Array) -> tuple[ArmProblem, tuple[int, ...]]:
@@ -181,7 +179,7 @@ class _System(NamedTuple):
 def _system(scene: SceneOrPath, path: InputPath, start: Equilibrium) -> tuple[_System, Array]:
     """The system, and its vector at the start of the path."""
     model = start.model
-    assert isinstance(model, StrainDependent)
+    assert isinstance(model, SteppedModel)
     free, problem = start.scene.free, problem_of(start.scene, start.inputs, model.grid(start.scene))
     length, share = problem.length, jnp.sqrt(problem.grid.weight / problem.length)
     unknown = ArmUnknown(free_components(start.state.xi, free), start.state.coupled)

@@ -17,7 +17,7 @@ from ..typing import ArrayLike, DTypeLike, Scalar, ScalarLike, VectorLike, cast,
 from ..validation import concrete, instance, instances, is_traced, numbers, precise
 from .actuator import Actuator
 from .description import Part, describe, described_arguments, table
-from .discs import inner_discs, rest_length, shared_discs
+from .discs import inner_discs, rest_length
 from .held import Support
 from .loads import Frame, Load
 from .obstacles import Obstacle
@@ -230,11 +230,6 @@ class Scene(Part):
             *(x for load in self.loads for x in load.breakpoints(self.rod)),
             *(held.X for held in self.held if held.X is not None),
         )
-
-    @property
-    def shared_discs(self) -> int:
-        """Most empty pieces of the arm where tendons run through the same discs."""
-        return shared_discs(self.rod, self.actuators)
 
     def edges(self, more: Sequence[ScalarLike] = ()) -> Float[Array, " edges"]:
         """Ends of the smooth pieces of the arm [m], `more` breakpoints included."""

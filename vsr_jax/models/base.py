@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..arm.discs import shared_discs
 from ..arm.routing import Path, thread_tangent
 from ..arm.scene import CrossSections, Scene, shared, together
 from ..elements.problem import loading, problem_of
@@ -116,12 +117,14 @@ class Model(eqx.Module):
     be taken from the balance instead of from `solve`.
 
     `begins_near`: whether `solve_from` begins at the solution near by. `remembers`: whether paths
-    of inputs can be followed by `at_rest` and `solve_after`.
+    of inputs can be followed by `at_rest` and `solve_after`. `on_nodes`: whether its state is an
+    `ArmSolution` on its `grid`, of the balance of `problem_of`.
     """
 
     balanced_everywhere: ClassVar[bool] = False
     begins_near: ClassVar[bool] = False
     remembers: ClassVar[bool] = False
+    on_nodes: ClassVar[bool] = False
 
     @abstractmethod
     def solve(self, scene: Scene, inputs: Float[Array, " inputs"]) -> Outcome:
@@ -271,7 +274,8 @@ class SteppedModel(Model):
         """Pieces that are empty since tendons share discs have steps of their own, not some of
         `steps`."""
         edges = scene.edges(self.breakpoints(scene))
-        return make_grid(edges, steps + scene.shared_discs, stages)
+        more = shared_discs(scene.rod, scene.actuators)
+        return make_grid(edges, steps + more, stages)
 
     def tip(self, scene: Scene, forces: Forces, state: Any) -> Pose:
         return tip_pose(self.node_strain(scene, state), self.grid(scene).h, scene.rod.frame)

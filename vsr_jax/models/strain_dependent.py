@@ -53,7 +53,7 @@ class StrainDependent(SteppedModel):
 
     steps: int = eqx.field(static=True)
     order: int = eqx.field(static=True)
-    balanced_everywhere = begins_near = remembers = True
+    balanced_everywhere = begins_near = remembers = on_nodes = True
 
     def __init__(self, steps: int = 32, order: int = 6):
         self.steps = count("StrainDependent.steps", steps)

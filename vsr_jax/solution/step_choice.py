@@ -17,6 +17,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from ..arm.discs import shared_discs
 from ..arm.scene import Scene
 from ..mechanics.balance import forces_where
 from ..models.base import Status, resolved
@@ -249,7 +250,7 @@ class _Trial(StrainDependent):
         self.wanted = wanted
 
     def grid(self, scene: Scene) -> Grid:
-        more = scene.shared_discs
+        more = shared_discs(scene.rod, scene.actuators)
         return make_grid(scene.edges(), self.wanted + more, self.order // 2, room=self.steps + more)
 
 
