@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import with_derivative
+from scipy.integrate import quad
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 from scipy.special import ellipe, ellipk
@@ -174,3 +175,69 @@ def test_the_margin_of_a_held_arm_can_be_differentiated():
     euler = 20.190728556426629 * stiffness() / L**2
     slope = jax.jit(jax.grad(margin))(0.3 * euler)
     np.testing.assert_allclose(slope, -1 / euler, rtol=1e-5)
+
+
+def wire(length=1.0, radius=1e-3, young=200e9, shear=80e9):
+    return vsr.Rod(length, vsr.Circular(radius), vsr.Material(young, shear=shear, density=7800.0))
+
+
+TAUT = {
+    "natural length": ({}, 0.0, {}),
+    "1e-9": ({}, 1e-9, {}),
+    "1e-5": ({}, 1e-5, {}),
+    "1e-3": ({}, 1e-3, {}),
+    "short of Euler's load": ({}, -5e-6, {}),
+    "pinned": ({}, 1e-5, {"orientation": None}),
+    "rubber": ({"young": 1e6, "shear": 4e5}, 1e-5, {}),
+    "eight steps": ({}, 1e-5, {"steps": 8}),
+    "no shear": ({}, 1e-5, {"free_strains": ("torsion", *BENDING, "elongation")}),
+    "stout": ({"radius": 0.05}, 1e-4, {}),
+    "hair": ({"radius": 3e-5}, 1e-4, {}),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TAUT)
+def test_a_taut_wire_bears_its_stretch(name):
+    """N = EA s, straight: lengths and curvatures differ by the square of the slenderness."""
+    numbers, stretch, options = TAUT[name]
+    arm, turn = wire(**numbers), options.get("orientation", np.eye(3))
+    end = vsr.Held(position=(1 + stretch, 0, 0), orientation=turn)
+    free = options.get("free_strains", vsr.arm.STRAINS)
+    model = vsr.StrainDependent(options.get("steps", 32))
+    eq = vsr.solve(vsr.Scene(arm, held=end, free_strains=free), [], model=model)
+    assert eq.status == vsr.Status.CONVERGED
+    axial = numbers.get("young", 200e9) * np.pi * numbers.get("radius", 1e-3) ** 2
+    np.testing.assert_allclose(eq.supports[0, 3], axial * stretch, rtol=1e-6, atol=1e-12 * axial)
+    np.testing.assert_allclose(eq.curvature(np.linspace(0, 1, 7)), 0, atol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("aside", [5e-5, 5e-4])
+def test_a_wire_held_aside_in_its_middle(aside):
+    r"""Each half is a beam of length l between clamps, under a tension N that its own deflection w
+    causes, with slopes $w' = V / N (1 - \cosh(k (x - l/2)) / \cosh(k l / 2))$, $k^2 = N / EI$, for
+    small slopes."""
+    half, bending, axial = 0.05, 200e9 * np.pi / 4 * 2e-4**4, 200e9 * np.pi * 2e-4**2
+
+    def slopes(N):
+        k = np.sqrt(N / bending)
+        shear = N * aside / (half - 2 / k * np.tanh(k * half / 2))
+        return (
+            shear,
+            lambda x: shear / N * (1 - np.cosh(k * (x - half / 2)) / np.cosh(k * half / 2)),
+        )
+
+    def excess(N):
+        slope = slopes(N)[1]
+        return N - axial / half * quad(lambda x: 0.5 * slope(x) ** 2, 0, half, epsabs=1e-15)[0]
+
+    tension = brentq(excess, 1e-6, 10.0, xtol=1e-12)
+    ends = [
+        vsr.Held(half, position=(half, aside, 0)),
+        vsr.Held(position=(2 * half, 0, 0), orientation=np.eye(3)),
+    ]
+    eq = vsr.solve(vsr.Scene(wire(length=0.1, radius=2e-4), held=ends), [])
+    assert eq.status == vsr.Status.CONVERGED
+    np.testing.assert_allclose(eq.supports[0, 4], 2 * slopes(tension)[0], rtol=1e-3)
+    np.testing.assert_allclose(eq.supports[1, 3], tension, rtol=1e-3)

@@ -67,7 +67,6 @@ class Surroundings(AppliedLoad):
     force: Array
     soft: Array | None
     rough: Rough | None = None
-    nearly_rigid = True
 
     @property
     def motion(self) -> int:

@@ -85,12 +85,9 @@ class AppliedLoad(eqx.Module):
       or 6 (and displacement).
     - `local`: whether it acts only between sections that it joins: without other loads the arm can
       be cut between those.
-    - `nearly_rigid`: whether it changes so fast that its tangent needs the precision of the
-      unknowns.
     """
 
     local: ClassVar[bool] = False
-    nearly_rigid: ClassVar[bool] = False
 
     @property
     def conservative(self) -> Array | bool:
@@ -164,12 +161,6 @@ class Loading(NamedTuple):
     def spans(self) -> bool:
         """Whether some loads act across spans of an arm that others bend too."""
         return any(load.local for load in self.loads) and not self.local
-
-    @property
-    def nearly_rigid(self) -> bool:
-        """Whether a load is, or acts across spans of an arm that others bend: without their own
-        stiffness, which is added last, the tangent may be singular."""
-        return self.spans or any(load.nearly_rigid for load in self.loads)
 
     @property
     def motion(self) -> int:

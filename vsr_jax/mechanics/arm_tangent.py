@@ -50,13 +50,15 @@ def approximate_solve(
     and whether that is doubtful.
 
     In single precision: the passes along the arm are bound by memory, and rounding is far below the
-    error of the elimination. Loads that are nearly rigid keep the precision of the unknowns.
+    error of the elimination. Two keep the precision of the unknowns: constraints, since an arm may
+    be a million times as stiff along its axis as across, and loads across spans, without whose own
+    stiffness, which is added last, the tangent may be singular.
 
     **Arguments:** `symmetric`: with the contact forces that friction follows held; `apart`: solve
     for `right` apart from all that does not depend on it, in place of one pass for everything, so
     that derivatives by `right` repeat only the former.
     """
-    if at.loads is None or not at.loads.nearly_rigid:
+    if not (problem.constrained or (at.loads is not None and at.loads.spans)):
         unknown, at, right, problem, damping = c.single(
             (unknown, at, right, problem, jnp.asarray(damping))
         )
