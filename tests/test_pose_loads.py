@@ -407,3 +407,24 @@ def test_scene_files_hold_them(tmp_path):
 def test_what_is_refused(make, message, unchecked):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+@pytest.mark.slow
+def test_second_derivatives_at_the_natural_length_of_a_spring():
+    """Along the arm: by symmetry, aside and up do not mix, and the other entries are those of an
+    anchor a little off the axis."""
+    arm = vsr.Rod(0.3, vsr.Circular(0.006), vsr.Material(1e6, poisson=0.45))
+
+    def up(anchor):
+        spring = vsr.Spring(anchor, 2.0, length=0.1)
+        return vsr.solve(vsr.Scene(arm, loads=[spring]), [], model=vsr.StrainDependent(8)).tip[2, 3]
+
+    slope = jax.jit(jax.grad(up))
+    h = 1e-5
+    found = jax.jit(jax.hessian(up))(jnp.array([0.4, 0.0, 0.0]))
+    columns = []
+    for unit in np.eye(3):
+        ahead, behind = (slope(jnp.array([0.4, 0.0, 0.0]) + s * h * unit) for s in (1, -1))
+        columns.append((ahead - behind) / (2 * h))
+    np.testing.assert_allclose(found, np.stack(columns), atol=1e-4 * np.abs(found).max())
+    assert found[0, 2] > 100

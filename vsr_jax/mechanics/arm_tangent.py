@@ -256,6 +256,9 @@ def _refined(apply: Callable, nearly: Callable, right: Array, kept: int) -> Arra
     solution is accepted by its own residual, in a last step of the same loop, so that the program
     holds the product once.
     """
+    # the approximate tangent, in single precision, would take a right side of rounding for zero
+    largest = jnp.max(jnp.abs(right))
+    right = right / jnp.where(largest > 0, largest, 1.0)
     eps, size = jnp.finfo(right.dtype).eps, jnp.linalg.norm(right)
 
     def whole(x: Array) -> Array:
@@ -282,4 +285,4 @@ def _refined(apply: Callable, nearly: Callable, right: Array, kept: int) -> Arra
     none, no = jnp.zeros((kept, *right.shape), right.dtype) + nothing, nothing > 0
     begin = _Refinement(none[0], right, none, none, nothing, ~(size > 0), no, no)
     end = lax.while_loop(lambda at: ~at.done, advance, begin)
-    return jnp.where(end.found, end.x, jnp.nan)  # no derivative rather than a wrong one
+    return jnp.where(end.found, largest * end.x, jnp.nan)  # no derivative rather than a wrong one
