@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from vsr_jax.numerics.batching import iterated
-from vsr_jax.numerics.damped_newton import damped_newton
-from vsr_jax.numerics.damped_rules import Damped, Measures
+from vsr_jax.numerics.damped_newton import Damped, Measures, damped_newton
 
 
 def solved(stiffness, says_definite, dtype, cubic=1.0):

@@ -31,7 +31,9 @@ PACKAGES = (
 )
 """A module imports from its own package and from those before it; `typing` and `validation` serve
 all."""
-MODULES = sorted(path.relative_to(FOLDER).as_posix() for path in FOLDER.glob("*/*.py"))
+MODULES = sorted(path.relative_to(FOLDER).as_posix() for path in FOLDER.glob("*/**/*.py"))
+FOLDERS = sorted({pathlib.PurePath(name).parent.as_posix() for name in MODULES})
+"""The packages, and those in them."""
 
 
 @functools.cache
@@ -41,7 +43,7 @@ def imports(path):
 
 
 def _imports(path):
-    own = path.parent.name
+    own = path.relative_to(FOLDER).parts[:-1]
     for node in ast.walk(ast.parse(path.read_text())):
         if not isinstance(node, ast.ImportFrom):
             continue
@@ -49,8 +51,8 @@ def _imports(path):
         if node.level == 0:
             if not parts or parts.pop(0) != "vsr_jax":
                 continue
-        elif node.level == 1:
-            parts = [own, *parts]
+        else:
+            parts = [*own[: len(own) + 1 - node.level], *parts]
         yield from ((*parts, alias.name) for alias in node.names)
 
 
@@ -66,16 +68,19 @@ def test_imports_go_one_way(name):
         assert place[0] in (*allowed, "typing", "validation", "__version__"), place
 
 
-@pytest.mark.parametrize("package", PACKAGES)
+@pytest.mark.parametrize("package", FOLDERS)
 def test_a_package_has_no_cycle(package):
-    """Its modules can be put in an order in which each imports only earlier ones."""
-    names = {path.stem for path in (FOLDER / package).glob("*.py")} - {"__init__"}
+    """Its modules, and packages in it, can be put in an order in which each imports only earlier
+    ones."""
+    folder, place = FOLDER / package, tuple(package.split("/"))
+    files = {path.stem: [path] for path in folder.glob("*.py") if path.stem != "__init__"}
+    files |= {path.parent.name: sorted(path.parent.glob("*.py")) for path in folder.glob("*/*.py")}
 
     def needed(name):
-        own = [p for p in imports(FOLDER / package / f"{name}.py") if p[0] == package]
-        return {part for place in own for part in place[1:2] if part in names}
+        own = [p[len(place) :] for f in files[name] for p in imports(f) if p[: len(place)] == place]
+        return {part for rest in own for part in rest[:1] if part in files} - {name}
 
-    needs = {name: needed(name) for name in names}
+    needs = {name: needed(name) for name in files}
     while ready := {name for name, others in needs.items() if not others}:
         needs = {name: others - ready for name, others in needs.items() if name not in ready}
     assert needs == {}

@@ -45,7 +45,7 @@ from ..mechanics.applied_load import Exerted, finite
 from ..mechanics.coupling import SOFTENED, ArmProblem, ArmState, Constraint, Coupling, Scales
 from ..mechanics.sizes import softest
 from ..numerics.component import Forces, Vector
-from ..numerics.damped_rules import HARDENING_STAGES, SOFT_STAGES
+from ..numerics.damped_newton import HARDENING_STAGES, SOFT_STAGES
 from ..numerics.quadrature import Grid, locate
 from ..numerics.se3 import base_pose, stacked_rotation
 from ..typing import DTypeLike

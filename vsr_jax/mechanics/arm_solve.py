@@ -22,8 +22,14 @@ from ..numerics.batching import (
     side_by_side,
 )
 from ..numerics.component import Vector, free_components, spread
-from ..numerics.damped_newton import LOAD_INCREMENTS, MAX_TURN, damped_newton
-from ..numerics.damped_rules import HARDENING_STAGES, Damped, Measures
+from ..numerics.damped_newton import (
+    HARDENING_STAGES,
+    LOAD_INCREMENTS,
+    MAX_TURN,
+    Damped,
+    Measures,
+    damped_newton,
+)
 from ..numerics.implicit import implicit_root
 from ..numerics.newton import Root
 from ..numerics.once import once

@@ -28,7 +28,7 @@ from ..arm.scene import CrossSections, Scene
 from ..chain import Border, Coupled
 from ..chain.border import listed
 from ..numerics.component import Forces, Vector
-from ..numerics.damped_rules import HARDENING_STAGES, SOFT_STAGES
+from ..numerics.damped_newton import HARDENING_STAGES, SOFT_STAGES
 from ..numerics.quadrature import Grid
 from .applied_load import AppliedLoad, Exerted, Loading
 from .balance import without_force

@@ -20,8 +20,13 @@ from ..mechanics.coupling import ArmProblem, ArmState, borders_of
 from ..numerics import component as c, lu
 from ..numerics.batching import arms_in, iterated, side_by_side
 from ..numerics.component import Vector
-from ..numerics.damped_newton import LOAD_INCREMENTS, MAX_TURN, damped_newton
-from ..numerics.damped_rules import Damped, Measures
+from ..numerics.damped_newton import (
+    LOAD_INCREMENTS,
+    MAX_TURN,
+    Damped,
+    Measures,
+    damped_newton,
+)
 from ..numerics.implicit import implicit_root
 from ..numerics.newton import Root
 from ..numerics.quadrature import Grid

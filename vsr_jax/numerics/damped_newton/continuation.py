@@ -1,0 +1,138 @@
+"""The way to the whole problem: load increments, stages of constraints, loosening and a second
+attempt."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ..component import select
+from . import convergence, probe, termination
+from .problem import Schedule, Setting
+from .state import Path, State, Trial, Verdict
+
+LOAD_INCREMENTS = 5
+"""Increments in which `damped_newton` applies the loads where they cannot be applied at once: the
+tangent is often indefinite at the start under all loads."""
+SOFT_STAGES, HARDENING_STAGES = 1, 4
+"""Number of levels after the loads with springs in place of constraints, which have an energy, and
+of all by which constraints harden in `damped_newton`."""
+_FIRST_DAMPING = 1.0
+"""Damping to begin with where all loads are one increment."""
+_FIRST_STAGES = 100
+"""Bound on the evaluations of the first careful attempt where there are stages."""
+_SLOW_DAMPING, _HARDER = 100.0, 0.25
+"""Damping with which the second one begins, and by how much of a stage its springs are harder."""
+_SETTLED = 0.3
+"""Norm of an undamped step, or angle [rad] by which it turns the arm, below which the next stage
+begins."""
+_SLIDING, _CLOSE = 20, 1e-3
+"""Bound on the evaluations of a first attempt where something slides with friction, and norm of a
+step below which the attempt may take twice as many."""
+_JUMPING, _BACK = 40, 2
+"""Number of evaluations without an energy after which the problem is loosened, and by how many
+stages it goes back then."""
+
+
+class Attempt(NamedTuple):
+    """Damping and path with which an attempt begins."""
+
+    damping: Array
+    path: Path
+
+
+def attempts(like: Array, schedule: Schedule) -> tuple[Attempt, Attempt]:
+    """The first and the second attempt."""
+    no = jnp.zeros(like.shape, bool)
+    path = Path(jnp.ones_like(like), no, no, jnp.zeros(like.shape, jnp.int32))
+    first = 0.0 if schedule.increments > 1 else _FIRST_DAMPING
+    careful = Attempt(jnp.full_like(like, first), path)
+    again = path._replace(restarted=~no)
+    if schedule.direct:
+        whole = path._replace(level=jnp.full_like(like, schedule.last))
+        return Attempt(jnp.zeros_like(like), whole), careful._replace(path=again)
+    slow = again._replace(level=again.level + _HARDER, loose=~no)
+    return careful, Attempt(jnp.full_like(like, _SLOW_DAMPING), slow)
+
+
+def is_slow(path: Path, schedule: Schedule) -> Array:
+    """Which problems are in a second attempt that follows a careful one."""
+    return path.restarted & (not schedule.direct)
+
+
+def next_level(state: State, turn: Array, schedule: Schedule) -> Array:
+    """Level of the next evaluation, after a step that turns the arm by some angle: one more than
+    before if the step is ready to be tried. A stage ends with a small undamped step, and all of
+    them where the constraints hold by a wide margin."""
+    level, ready, last = state.path.level, state.control.ready, schedule.last
+    following = jnp.where(ready, jnp.minimum(level + 1, schedule.increments), level)
+    if not schedule.stages:
+        return following
+    turns_little = ~is_slow(state.path, schedule) & (turn < _SETTLED)
+    small = (state.local.step_norm < _SETTLED) | turns_little
+    settled = ready & (state.control.damping == 0) & small
+    harder = jnp.where(state.local.clear, last, jnp.minimum(level + 1, last))
+    harder = jnp.where(settled, harder, level)
+    return jnp.where(level >= schedule.increments, harder, following)
+
+
+def share(level: Array, schedule: Schedule) -> Array:
+    """Share of the loads at a level, and above 1 that of the stages."""
+    loads = jnp.minimum(level / schedule.increments, 1.0)
+    if not schedule.stages:
+        return loads
+    return loads + jnp.maximum(level - schedule.increments, 0.0) / schedule.stages
+
+
+def without_energy(path: Path, level: Array, slides: Array | None, schedule: Schedule) -> Array:
+    """Which problems have no energy at a level: those with nearly exact constraints, and in the
+    first attempt those in which something slides."""
+    careful = path.restarted | (not schedule.direct)
+    none = careful & (level >= schedule.increments + SOFT_STAGES)
+    return none if slides is None else none | (slides & ~path.restarted)
+
+
+def updated(path: Path, trial: Trial, verdict: Verdict) -> Path:
+    """Path after a trial."""
+    return path._replace(level=jnp.where(verdict.accepted, trial.level, path.level))
+
+
+def loosened(state: State, trial: Trial, busy: Array, schedule: Schedule) -> State:
+    """The state, or that of the loosened problem where nearly exact constraints have jumped without
+    end: it goes on from where it is."""
+    path = state.path
+    path = path._replace(
+        without_energy=path.without_energy + trial.without_energy.astype(jnp.int32)
+    )
+    jumping = (path.without_energy >= _JUMPING) & busy & ~path.loose
+    back = state._replace(
+        path=path._replace(
+            level=jnp.full_like(path.level, schedule.last - _BACK),
+            loose=~jnp.zeros_like(path.loose),
+        ),
+        convergence=convergence.begin(path.level),
+    )
+    return select(jumping, back, state._replace(path=path))
+
+
+def fails(
+    state: State, trial: Trial, verdict: Verdict, busy: Array | None, setting: Setting
+) -> Array:
+    """Which first attempts fail, so that the second one begins."""
+    if setting.schedule.direct:
+        return _direct_fails(state, trial, verdict)
+    assert busy is not None
+    unsolved = ~busy & ~(probe.stable(state) & termination.converged(state, setting))
+    return unsolved | (state.evaluations >= _FIRST_STAGES)
+
+
+def _direct_fails(state: State, trial: Trial, verdict: Verdict) -> Array:
+    """Which direct attempts fail: at the first step that is not accepted, at the first tangent that
+    is not positive definite, or as unstable; where something slides, after some evaluations."""
+    stopped = ~(verdict.accepted & trial.new.definite)
+    failed = jnp.where(trial.solving, stopped, probe.unstable(state.probe))
+    if verdict.sliding is None:
+        return failed
+    most = jnp.where(state.local.step_norm < _CLOSE, 2 * _SLIDING, _SLIDING)
+    late = trial.solving & (state.evaluations > most)
+    return (failed & ~(trial.solving & verdict.sliding)) | late
