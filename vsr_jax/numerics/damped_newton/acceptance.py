@@ -37,11 +37,9 @@ def judge(state: State, trial: Trial, setting: Setting) -> Verdict:
     """What becomes of the step of a trial. A point that was evaluated only with more damping is
     kept."""
     tolerance, schedule = setting.tolerance, setting.schedule
-    control, level, merit = state.control, state.path.level, trial.new.merit
+    control, merit = state.control, trial.new.merit
     better = (
-        (level < schedule.increments)
-        | (level < trial.level)
-        | (trial.work >= -control.slope)
+        (trial.work >= -control.slope)
         | (merit < state.local.residual_norm)
         | (merit < tolerance.rounding)
         | trial.forced
@@ -60,7 +58,12 @@ def judge(state: State, trial: Trial, setting: Setting) -> Verdict:
 
 
 def _rises_sliding(state: State, trial: Trial, tolerance: Tolerance) -> Array:
-    """Whether something slides and the residual does not become smaller."""
+    """Whether something slides, so that no energy can fall, and the residual does not become
+    smaller.
+
+    Without cuts of such steps, eight of 1,344 samples on floors fail in place of two
+    (benchmarks/friction_search.py --arms 64 --steps 12).
+    """
     assert trial.new.slides is not None
     control, same = state.control, state.path.level == trial.level
     here = trial.new.slides & control.ready & same & (control.cuts < _SLIDING_CUTS)
@@ -69,7 +72,10 @@ def _rises_sliding(state: State, trial: Trial, tolerance: Tolerance) -> Array:
 
 
 def _may_be_steep(state: State, trial: Trial, schedule: Schedule) -> Array:
-    """Whether springs stand for constraints, which may be too steep for the step."""
+    """Whether springs stand for constraints, which may be too steep for the step.
+
+    Without cuts of such steps, held arms take 6 % and arms in bent tubes 5 % more evaluations.
+    """
     control = state.control
     other = trial.probing | trial.forced | continuation.is_slow(state.path, schedule)
     loaded = state.path.level >= schedule.increments

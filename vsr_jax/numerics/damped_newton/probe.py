@@ -2,7 +2,9 @@ r"""Stability probe of a solution whose tangent is doubtful: the arm is moved fr
 
 $$s_{n+1} = s_n + (H + \mu \Sigma)^{-1} r(x - s_n).$$
 
-The solution is unstable if the motion grows after some steps.
+The solution is unstable if the motion grows after some steps. Without the probe, solutions with a
+pair of unstable motions, which pivots miss, are called stable
+(`test_a_doubtful_root_without_stability_is_found_out` in tests/test_damped_newton.py).
 """
 
 from typing import Any
@@ -40,7 +42,12 @@ def pending(state: State, solving: Array, tolerance: Tolerance) -> Array:
 
 def displaced(state: State, probing: Array, measures: Measures) -> Any:
     """The steps, those of a probe made so small that the residual is linear and so large that its
-    rounding is small. The first one also stirs the motions that a symmetric problem never makes."""
+    rounding is small.
+
+    The first one also stirs the motions that a symmetric problem never makes. Without it, an arm
+    that leaves its plane is called stable
+    (`test_an_arm_in_a_plane_that_is_unstable_across_it_is_found_out` in tests/test_hard_loads.py).
+    """
     size = measures.turn(state.step)
     small = jnp.finfo(size.dtype).eps ** 0.25
     scale = jnp.where(probing, small / jnp.where(size > 0, size, 1.0), 1.0)
@@ -54,7 +61,12 @@ def displaced(state: State, probing: Array, measures: Measures) -> Any:
 
 def left_to_it(new: Damped, old: Local) -> Damped:
     """The evaluation; in single precision and near the solution, a doubtful tangent is taken to be
-    as definite as the one before it: rounding may change a sign. The probe decides in the end."""
+    as definite as the one before it: rounding may change a sign. The probe decides in the end.
+
+    Without this, a stable solution is called unstable
+    (`test_a_wrong_sign_near_the_root_is_rounding_in_single_precision` in
+    tests/test_damped_newton.py).
+    """
     if new.size.dtype != jnp.float32:
         return new
     same = old.definite & new.doubtful & (new.size < _CLOSE)

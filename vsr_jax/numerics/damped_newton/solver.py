@@ -177,7 +177,7 @@ class _Method(NamedTuple):
             level=level,
             new=probe.left_to_it(new, state.local),
             work=measures.work(new.residual, step),
-            without_energy=continuation.without_energy(state.path, level, new.slides, schedule),
+            without_energy=continuation.without_energy(state.path, level, schedule),
         )
 
     def _continued(self, state: State, trial: Trial, verdict: Verdict) -> State:
