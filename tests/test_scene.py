@@ -93,7 +93,7 @@ NUMBERS = {
     **{"X": 0.1, "length": 0.5, "y": 0.001, "z": 0.0, "angle": 1.0, "value": 2.0, "factor": 0.5},
     **{"point": [0.1, 0.0, 0.2], "position": (0.1, 0.0, 0.2), "heading": FORWARD},
     **{"lengths": [0.1, 0.2], "inputs": [1.0, 2.0, 3.0], "rotation": np.eye(3).tolist()},
-    **{"axes": np.eye(3).tolist(), "rod": BENT, "frame": "world"},
+    **{"base": np.eye(4).tolist(), "rod": BENT, "frame": "world", "rest": 0.5},
 }
 INTEGERS = {
     **NUMBERS,

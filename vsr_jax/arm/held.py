@@ -1,7 +1,6 @@
 """Sections of an arm that are held in space: pinned, clamped, guided, or by rows of one's own."""
 
 from abc import abstractmethod
-from dataclasses import replace
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -121,10 +120,12 @@ class Held(Support):
         return self.position is not None
 
     def settled(self, rotation: MatrixLike, position: VectorLike) -> "Held":
-        return replace(
-            self,
-            position=None if self.position is None else real(position),
-            orientation=None if self.orientation is None else real(rotation),
+        pose = (
+            None if self.position is None else real(position),
+            None if self.orientation is None else real(rotation),
+        )
+        return eqx.tree_at(
+            lambda held: (held.position, held.orientation), self, pose, is_leaf=lambda x: x is None
         )
 
     def deviation(
