@@ -108,6 +108,15 @@ def test_a_constant_of_the_function_is_part_of_the_program(monkeypatch, tmp_path
     assert summed(2.0)(jnp.ones(())) == 8.0
 
 
+def test_arguments_that_are_not_used_are_part_of_the_program(monkeypatch, tmp_path):
+    monkeypatch.setenv("VSR_JAX_CACHE", str(tmp_path))
+    one, three = jnp.array(1.0), jnp.array([3.0, 4.0, 5.0])
+    assert program("first")(lambda a, b: 2 * a)(one, three) == 2.0
+    assert program("second")(lambda b, a: 2 * a)(three, one) == 2.0
+    assert program("third")(lambda a, b: 2 * b)(one, jnp.array(7.0)) == 14.0
+    assert program("fourth")(lambda a, b: 2 * a)(one, jnp.array(7.0)) == 2.0
+
+
 @pytest.mark.parametrize("content", [b"", b"no program", None])
 def test_a_damaged_program_is_compiled_again(monkeypatch, tmp_path, content):
     monkeypatch.setenv("VSR_JAX_CACHE", str(tmp_path))

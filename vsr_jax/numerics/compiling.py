@@ -124,7 +124,8 @@ class _Kind:
     def prepare(self, arrays: list[Array]) -> bool:
         """Compiles the program; False where it has other inputs than the arrays, traced numbers
         that a function among the static leaves closes over."""
-        traced = jax.jit(self._flat).trace(arrays)
+        # without unused arguments, programs with other arguments have the same text in the store
+        traced = jax.jit(self._flat, keep_unused=True).trace(arrays)
         if len(traced.jaxpr.in_avals) != len(arrays):
             return False
         lowered, quick = traced.lower(), _quick_options()
