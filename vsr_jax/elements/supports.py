@@ -137,7 +137,7 @@ class Supports(Constraint):
 
     def relaxed(self) -> "Supports":
         """Sections that are held where they are at rest."""
-        return replace(finite(self), sections=tuple(one.settled() for one in self.sections))
+        return finite(replace(self, sections=tuple(one.settled() for one in self.sections)))
 
     def softened(self, hardness: Array) -> "Supports":
         return replace(self, soft=(hardness < SOFTENED).astype(self.stiffness.dtype))
