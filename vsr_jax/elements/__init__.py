@@ -1,2 +1,6 @@
-"""What acts on an arm: loads, supports, contacts, and what drives its threads, on the nodes of a
-grid."""
+"""What acts on an arm, on the nodes of a grid: loads, supports, contacts, laws and friction of
+threads.
+
+Each derives from an interface of `mechanics`; `problem` assembles them for a scene. Nothing here
+knows how an equilibrium is found.
+"""
