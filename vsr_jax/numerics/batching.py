@@ -124,7 +124,8 @@ def _by_parts(
 
 def arms_in(tree: Any, axes: int) -> tuple[int, ...]:
     """Shape of the batch of arms: what the last `axes` axes of all arrays broadcast to."""
-    return np.broadcast_shapes(*(x.shape[x.ndim - axes :] for x in jax.tree.leaves(tree)))
+    shapes = [np.shape(x) for x in jax.tree.leaves(tree)]
+    return np.broadcast_shapes(*(shape[len(shape) - axes :] for shape in shapes if shape))
 
 
 def of_each_arm(function: Callable, arms: tuple[int, ...], *arguments: Any) -> Any:
