@@ -69,6 +69,22 @@ def test_a_muscle_that_overcomes_the_arm_is_unstable():
     assert above.status != vsr.Status.CONVERGED
 
 
+def test_a_muscle_with_an_elastic_tendon():
+    """A tendon of the stiffness k [N] in series: $T = a F (1 - c e)$, $l / l_0 - 1 = e + T / k$."""
+
+    class Series(Muscle):
+        cable_stiffness = 30.0
+
+    slope, peak = 6.0, 1.0
+    pull = Series(vsr.Parallel(OFFSET, 0.0), jnp.asarray(2 * peak), jnp.asarray(slope))
+    scene = vsr.Scene(ARM, [pull], free_strains=["bending_z"])
+    eq = vsr.solve(scene, [0.5], model=MODEL, throw=True)
+    give = OFFSET**2 / EI + 1 / 30.0
+    np.testing.assert_allclose(-eq.forces[0], peak / (1 - peak * slope * give), rtol=1e-9)
+    gain = -peak * slope / LENGTH / (1 - peak * slope / 30.0)
+    np.testing.assert_allclose(eq.stability, 1 + gain * LENGTH * OFFSET**2 / EI, rtol=1e-9)
+
+
 @pytest.mark.slow
 def test_the_law_of_a_cable_is_that_of_a_tendon_of_given_length():
     """A linear spring of a cable that only pulls, beside `Tendon(stiffness=...)`."""

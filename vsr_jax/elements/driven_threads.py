@@ -59,6 +59,11 @@ class Driven(NamedTuple):
         none = Law(tension, jnp.ones_like(tension), jnp.zeros_like(tension))
         return select(self.idle > 0, none, found)
 
+    def gives(self, law: "Law", gain: Array | None, grid: Grid) -> Array:
+        """Derivative of the law by the tension at a given length of the path, with the stretch by
+        the `gain` of the tension along it."""
+        return law.by_tension - law.by_length * self.stretch(gain, grid)
+
     def slack(self, tension: Array, path: Array, share: Array | None, grid: Grid) -> Array:
         """Slack on a path of a given length [m], negative if the thread is too short."""
         return self.free - path + tension * self.stretch(share, grid)
@@ -160,10 +165,10 @@ class DrivenThreads(ThreadRule):
 
     def border(self, x: Array, at: ArmState, note: tuple[Law, ...], problem: ArmProblem) -> Border:
         pulls, lengths = self._wrenches(at, problem)
-        corner = []
-        for place, thread, law in zip(self.places, self.threads, note, strict=True):
-            stretch = thread.stretch(at.carried.gains[place], problem.grid)
-            corner.append(law.by_tension - law.by_length * stretch)
+        corner = [
+            thread.gives(law, at.carried.gains[place], problem.grid)
+            for place, thread, law in zip(self.places, self.threads, note, strict=True)
+        ]
         by_length = jnp.stack([law.by_length for law in note])
         # a pull that grows as its thread becomes shorter makes the arm less stable
         resists = jnp.where(by_length > 0, -1, 1)

@@ -27,6 +27,7 @@ from ..mechanics.applied_load import Exerted, Pose, finite
 from ..mechanics.coupling import SOFTENED, ArmProblem, ArmState, Constraint, Coupling, Scales
 from ..mechanics.reaction import Reaction, rotations
 from ..mechanics.sizes import softest
+from ..numerics.batching import arms_in, of_each_arm
 from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import Grid, before_point, beyond
 from ..numerics.se3 import base_pose
@@ -104,20 +105,20 @@ class HeldSection(NamedTuple):
         load = SupportForce(self.support, self.base, force, stiffness, soft)
         return PoseTerm(load, rod, jnp.ones_like(force[0]), self.X, self.step, self.before)
 
-    def deviation(self, rod: Rod, stiffness: Array, pose: Pose) -> Array:
+    def deviation(self, pose: Pose) -> Array:
         """For each row the deviation g and the wrench (6,) in the world frame by which it changes
         with a rotation and a displacement of the section, shape (rows, 7, ...)."""
 
-        def of_section(load: SupportForce, rod: Rod, X: Array, R: Array, r: Array) -> Array:
+        def of_arm(support: Support, base: Array, R: Array, r: Array) -> Array:
             def off(z: Array) -> Array:
-                turned = R + matmul(skew(z[:3]), R)
-                return load.support.deviation(load.base, turned, r + z[3:])
+                return support.deviation(base, R + matmul(skew(z[:3]), R), r + z[3:])
 
             zero = jnp.zeros(6, R.dtype)
             return jnp.concatenate([off(zero)[:, None], jax.jacfwd(off)(zero)], axis=1)
 
         section = pose.rotation_at(self.step), pose.position_behind(self.before)
-        return self.exerts(rod, stiffness, stiffness).each(of_section, *section)
+        given = self.support, self.base, *section
+        return of_each_arm(of_arm, arms_in(given, pose.grid.h.ndim - 1), *given)
 
 
 class Supports(Constraint):
@@ -155,9 +156,8 @@ class Supports(Constraint):
     def note(self, x: Array, at: ArmState, own: tuple[Exerted, ...], problem: ArmProblem) -> Array:
         """`HeldSection.deviation` of all."""
         assert at.along is not None  # a scene with supports reacts
-        every = zip(self.sections, self._parts(self.stiffness), strict=True)
         pose = at.along.pose
-        return jnp.concatenate([one.deviation(self.rod, k, pose) for one, k in every])
+        return jnp.concatenate([one.deviation(pose) for one in self.sections])
 
     def residual(
         self, x: Array, at: ArmState, note: Array, problem: ArmProblem, free: tuple[int, ...]

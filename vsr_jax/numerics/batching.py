@@ -133,7 +133,7 @@ def of_each_arm(function: Callable, arms: tuple[int, ...], *arguments: Any) -> A
     last axis of all arguments, of size 1 where they are the same for all arms."""
     if not arms:
         return function(*arguments)
-    every = jax.tree.map(lambda x: jnp.broadcast_to(x, (*x.shape[:-1], *arms)), arguments)
+    every = jax.tree.map(lambda x: jnp.broadcast_to(x, (*np.shape(x)[:-1], *arms)), arguments)
     return jax.vmap(function, -1, -1)(*every)
 
 

@@ -158,8 +158,9 @@ def arm_of(scene: Scene, inputs: Array, forces: Vector, nodes: Nodes) -> ScaledT
         else:
             thread = driven_of(scene, inputs[place], place, sections, grid)
             length = thread_length(scene, xi, sections, place, grid)
-            law = thread.law(-forces[place], length, nodes.shares[place], grid)
-            stiffness = -law.by_length / law.by_tension
+            share = nodes.shares[place]
+            law = thread.law(-forces[place], length, share, grid)
+            stiffness = -law.by_length / thread.gives(law, share, grid)
             springs.append(_springs(row, stiffness[None], scale, scene.free))
     return _tied(problem, ArmUnknown(xi, ()), units, ties, springs, scene.free)
 
