@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 
 from vsr_jax.numerics.batching import iterated
-from vsr_jax.numerics.damped_newton import Damped, Measures, damped_newton
+from vsr_jax.numerics.damped_newton import Damped, Measures, Schedule, damped_newton
 
 
 def solved(stiffness, says_definite, dtype, cubic=1.0):
     r"""Root of $k_i x_i + c x_i^3 - 1$ from 0, where the sign of the tangent is always doubtful."""
     k = jnp.asarray(stiffness, dtype)
 
-    def evaluate(x, damping, share, loose):
+    def evaluate(x, damping, stage):
         residual = k * x + cubic * x**3 - 1
         step = residual / (k + 3 * cubic * x**2 + damping)
         size = jnp.linalg.norm(step)
@@ -22,21 +22,22 @@ def solved(stiffness, says_definite, dtype, cubic=1.0):
     stirs = jnp.array([0.6, 0.8], dtype)
     measures = Measures(lambda r, step: jnp.sum(r * step), jnp.linalg.norm, stirs)
     floor = jnp.asarray(4 * jnp.finfo(dtype).eps, dtype)
-    return iterated(damped_newton(evaluate, measures, jnp.zeros(2, dtype), floor))
+    return iterated(damped_newton(evaluate, measures, jnp.zeros(2, dtype), floor, Schedule()))
 
 
 def test_a_softened_problem_alone_is_no_solution():
     """Where constraints are exact, the residual is not finite."""
 
     def solved(hardest):
-        def evaluate(x, damping, share, loose):
-            residual = jnp.where(share > hardest, jnp.nan, x - 1)
+        def evaluate(x, damping, stage):
+            residual = jnp.where(stage.share > hardest, jnp.nan, x - 1)
             step, no = residual / (1 + damping), jnp.array(False)
             size = jnp.linalg.norm(step)
             return Damped(step, size, residual, size, jnp.isfinite(size), no, no)
 
         measures = Measures(jnp.vdot, jnp.linalg.norm, jnp.array([0.6, 0.8]), jnp.vdot)
-        return iterated(damped_newton(evaluate, measures, jnp.zeros(2), jnp.array(1e-15), stages=4))
+        stages = Schedule(stages=4, soft=1)
+        return iterated(damped_newton(evaluate, measures, jnp.zeros(2), jnp.array(1e-15), stages))
 
     assert solved(2.0).converged
     assert not solved(1.9).converged

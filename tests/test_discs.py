@@ -180,6 +180,42 @@ def test_lengths_give_back_the_tensions(weighed):
     )
 
 
+BACKBONE = vsr.Rod(
+    0.245,
+    vsr.Circular(0.002),
+    vsr.Material(2.31e9, shear=849e6, density=742.7),
+    guide_radius=0.022,
+    base=vsr.pose(pointing="up"),
+)
+HOLES = (0.07667, 0.08167, 0.15833, 0.16333, 0.24)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.7, 1.0, 1.5])
+def test_three_lengths_that_pull_against_each_other(share):
+    """All are taut: the chords between the sections, measured in space, have the lengths of the
+    stretched cables."""
+    angles = np.radians([0, 120, 240])
+    paths = 0.021 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    tendons = [
+        vsr.Tendon(vsr.Parallel(y, z), control="length", stiffness=2474.0, disc_places=HOLES)
+        for y, z in paths
+    ]
+    scene = vsr.Scene(BACKBONE, tendons, vsr.Gravity())
+    changes = share * np.array([-7.5e-3, 2.3642e-3, 1.4824e-3])
+    eq = vsr.solve(scene, changes)
+    assert eq.status == vsr.Status.CONVERGED
+    assert eq.stability > 0.2
+    tensions = -np.asarray(eq.forces)
+    assert np.all(tensions > 0.5)
+    ends = np.array([0.0, *HOLES, 0.245])
+    poses = np.asarray(eq.pose(ends))
+    for (y, z), change, tension in zip(paths, changes, tensions, strict=True):
+        holes = poses[:, :3, :3] @ [0, y, z] + poses[:, :3, 3]
+        length = np.linalg.norm(np.diff(holes, axis=0), axis=1).sum()
+        np.testing.assert_allclose(length, (0.245 + change) * (1 + tension / 2474.0), atol=1e-9)
+
+
 @pytest.mark.slow
 def test_a_tendon_is_drawn_as_chords(weighed):
     corners = weighed.thread(1, jnp.array([0.0, 0.1, 0.2, 0.3]))

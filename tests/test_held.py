@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from conftest import with_derivative
-from scipy.integrate import quad
+from scipy.integrate import quad, solve_bvp
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 from scipy.special import ellipe, ellipk
@@ -241,3 +241,45 @@ def test_a_wire_held_aside_in_its_middle(aside):
     assert eq.status == vsr.Status.CONVERGED
     np.testing.assert_allclose(eq.supports[0, 4], 2 * slopes(tension)[0], rtol=1e-3)
     np.testing.assert_allclose(eq.supports[1, 3], tension, rtol=1e-3)
+
+
+def pinned_arch(arm, end, load):
+    """Force on the base of a planar arm between a clamp and a pin, under a load per length across,
+    by SciPy."""
+    stiff = [float(x) for x in arm.stiffness(0.0)]
+    bending, axial, shear = stiff[2], stiff[3], stiff[4]
+
+    def slopes(s, y, p):
+        _, _, angle, moment = y
+        cos, sin, across = np.cos(angle), np.sin(angle), p[1] - load * s
+        along, aside = 1 + (p[0] * cos + across * sin) / axial, (across * cos - p[0] * sin) / shear
+        dx, dz = along * cos - aside * sin, along * sin + aside * cos
+        return np.vstack([dx, dz, moment / bending, p[0] * dz - across * dx])
+
+    def ends(a, b, p):
+        return np.array([*a[:3], b[0] - end[0], b[1] - end[1], b[3]])
+
+    s = np.linspace(0, 1, 101)
+    high = 0.6 * np.sqrt(1 - end[0] ** 2 - end[1] ** 2)
+    z = end[1] * s + high * np.sin(np.pi * s) ** 2
+    guess = np.vstack([end[0] * s, z, np.gradient(z, s), np.zeros_like(s)])
+    p0 = np.array([load, 0.5 * load])
+    found = solve_bvp(slopes, ends, s, guess, p0, tol=1e-9, max_nodes=20_000)
+    assert found.success
+    return found.p
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("end", "load"), [((0.95, 0.1), 20), ((0.9, 0.1), 5), ((0.7, 0.3), 20)])
+def test_an_arm_held_with_slack_finds_its_stable_shape(end, load):
+    """The way from rest leads to shapes in the plane that are unstable across it."""
+    arm = vsr.Rod(1.0, vsr.Circular(0.01), vsr.Material(1e9, poisson=0.3))
+    load = load * 1e9 * np.pi / 4 * 0.01**4
+    held = vsr.Held(position=(end[0], 0, end[1]))
+    scene = vsr.Scene(arm, (), vsr.DistributedWrench(force=(0, 0, load)), held=held)
+    eq = vsr.solve(scene, [], model=vsr.StrainDependent(48))
+    assert eq.status == vsr.Status.CONVERGED
+    assert not eq.loosened
+    assert eq.stability > 0.02
+    force = pinned_arch(arm, end, load)
+    np.testing.assert_allclose(eq.supports[0, 3::2], force - [0, load], rtol=1e-6)

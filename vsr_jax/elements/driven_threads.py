@@ -8,6 +8,11 @@ cable of the free length $l^* + \delta$ is
 $$\min(T, k_0 s) = 0, \quad s = (l^* + \delta)(1 + T / k) - l,$$
 
 the complementarity of tension and slack, where the stiffness $k_0$ [N/m] only scales the two.
+
+On the way to a solution that Newton's method does not find at once, a spring in series with each
+thread becomes stiffer step by step. Without it, three taut cables that pull against each other make
+one another slack in turn, without end (`test_three_lengths_that_pull_against_each_other` in
+tests/test_discs.py).
 """
 
 from typing import NamedTuple
@@ -32,14 +37,18 @@ from ..numerics.stacked import stack
 from ..typing import Scalar
 from .chords import chords_of, pull_on
 
+_HARDER = 1e3
+"""Factor by which the springs at threads harden on the way, before they are rigid."""
+
 
 class Driven(NamedTuple):
     r"""A thread with a law.
 
     **Fields:** its `actuator` and `input`; the length [m] of its path at `rest`, and that of the
     unstretched thread, `free`; its compliance $1/k$ [1/N], None if it cannot be stretched; a
-    stiffness $k_0$ [N/m] that scales lengths to forces; `idle`: 1 where it exerts no force,
-    whatever its law.
+    stiffness $k_0$ [N/m] that scales lengths to forces; by how much its path `yields` [m/N] to
+    a tension at rest; `idle`: 1 where it exerts no force, whatever its law; compliance of a spring
+    in series with it, `soft` [m/N], None for none.
     """
 
     actuator: Actuator
@@ -48,11 +57,13 @@ class Driven(NamedTuple):
     free: Array
     compliance: Array | None
     scale: Array
+    yields: Array
     idle: Array
+    soft: Array | None = None
 
     def law(self, tension: Array, path: Array, share: Array | None, grid: Grid) -> "Law":
         """The law at a tension, a length of the path and a share of the tension along it."""
-        length = path - tension * self.stretch(share, grid)
+        length = path - tension * self._gives(share, grid)
         given = self.actuator, self.input, self.rest, self.scale, -tension, length
         arms = jnp.broadcast_shapes(tension.shape, path.shape)
         found = of_each_arm(_law_and_slopes, arms, *given)
@@ -62,7 +73,7 @@ class Driven(NamedTuple):
     def gives(self, law: "Law", gain: Array | None, grid: Grid) -> Array:
         """Derivative of the law by the tension at a given length of the path, with the stretch by
         the `gain` of the tension along it."""
-        return law.by_tension - law.by_length * self.stretch(gain, grid)
+        return law.by_tension - law.by_length * self._gives(gain, grid)
 
     def slack(self, tension: Array, path: Array, share: Array | None, grid: Grid) -> Array:
         """Slack on a path of a given length [m], negative if the thread is too short."""
@@ -78,6 +89,11 @@ class Driven(NamedTuple):
         reached = jnp.sum(jnp.where(share > 0, grid.weight, 0.0), axis=(0, 1))
         mean = jnp.sum(grid.weight * share, axis=(0, 1)) / reached
         return self.free * self.compliance * mean
+
+    def _gives(self, share: Array | None, grid: Grid) -> Array:
+        """Stretch per unit of the tension, with that of the spring."""
+        stretch = self.stretch(share, grid)
+        return stretch if self.soft is None else stretch + self.soft
 
 
 class Law(NamedTuple):
@@ -104,11 +120,17 @@ class DrivenThreads(ThreadRule):
 
     places: tuple[int, ...] = eqx.field(static=True)
     threads: tuple[Driven, ...]
+    hardens = True
 
     def relaxed(self) -> "DrivenThreads":
         """Threads without force."""
         idle = (one._replace(idle=jnp.ones_like(one.idle)) for one in finite(self.threads))
         return DrivenThreads(self.places, tuple(idle))
+
+    def softened(self, hardness: Array) -> "DrivenThreads":
+        soft = (1 - hardness) * _HARDER ** (-hardness)
+        found = (one._replace(soft=soft * one.yields) for one in self.threads)
+        return DrivenThreads(self.places, tuple(found))
 
     def guess(self, forces: Forces, grid: Grid) -> Float[Array, "threads ..."]:
         tensions = [jnp.broadcast_to(-forces[place], grid.h.shape[1:]) for place in self.places]
@@ -209,7 +231,18 @@ def driven_of(
     compliance = None if stiffness is None else 1 / stiffness
     scale = largest_force_scale(sections) / scene.rod.length
     free = actuator.free_length(rest, value)
-    return Driven(actuator, value, rest, free, compliance, scale, jnp.zeros_like(scale))
+    yields = _compliance_of_arm(sections, place, grid)
+    return Driven(actuator, value, rest, free, compliance, scale, yields, jnp.zeros_like(scale))
+
+
+def _compliance_of_arm(sections: CrossSections, place: int, grid: Grid) -> Array:
+    r"""By how much the path of a thread becomes shorter per unit of its tension, at rest [m/N]:
+    $\int b^T \Sigma^{-1} b \, dX$ of the wrench b of a unit force."""
+    path = sections.paths[place]
+    wrench = thread_wrench(thread_direction(sections.rest, path)[0], path)
+    parts = [part**2 / s for part, s in zip(wrench, sections.stiffness, strict=True)]
+    per_length = c.times(sections.flexible, sum(parts[1:], parts[0]))
+    return jnp.sum(grid.weight * c.times(sections.reach[place], per_length), axis=(0, 1))
 
 
 def thread_length(

@@ -26,8 +26,11 @@ from ..numerics.damped_newton import (
     HARDENING_STAGES,
     LOAD_INCREMENTS,
     MAX_TURN,
+    SOFT_STAGES,
     Damped,
     Measures,
+    Schedule,
+    Stage,
     damped_newton,
 )
 from ..numerics.implicit import implicit_root
@@ -46,8 +49,9 @@ _LANES, _QUEUED = 48, 1024
 most: some need four times as many steps as most."""
 
 _BOW = 0.05
-"""Angle [rad] by which an arm with loosened constraints is bent and twisted at rest until they are
-exact: without, symmetric arms that are unstable are found in place of those beside them."""
+"""Angle [rad] by which an arm with constraints is bent and twisted at rest in a second attempt,
+until these are exact. Without it, the attempt ends on symmetric shapes that are unstable
+(`test_an_arm_held_with_slack_finds_its_stable_shape` in tests/test_held.py)."""
 
 _START_STEPS = 4
 """Fixed-point steps to the start: each gains a factor of the strains that threads cause."""
@@ -286,11 +290,11 @@ def _iteration(
     )
     sizes = _Sizes(whole, free, arms)
 
-    def evaluate(point: _Point, damping: Array, share: Array, loose: Array) -> Damped:
-        problem = whole.loosened(loose).with_share(share)
-        if whole.constrained and guess is None:
-            soft = jnp.clip(2.0 - share, 0.0, 1.0)
-            problem = problem.bowed(jnp.where(loose, _BOW * soft, 0.0))
+    def evaluate(point: _Point, damping: Array, stage: Stage) -> Damped:
+        problem = whole.loosened(stage.loose).with_share(stage.share)
+        if whole.constrained:
+            soft = jnp.clip(2.0 - stage.share, 0.0, 1.0)
+            problem = problem.bowed(jnp.where(stage.restarted, _BOW * soft, 0.0))
         unknown = _unknown(point, whole, free)
         imbalance, changes, at = _linearized(unknown, problem, free)
         step, definite, doubtful = approximate_solve(unknown, at, imbalance, problem, free, damping)
@@ -313,7 +317,18 @@ def _iteration(
         Measures(sizes.work, sizes.turn, sizes.stirs(start), dot),
         start,
         floor,
-        1 if whole.loads is None or whole.begins_soft else LOAD_INCREMENTS,
+        _schedule(whole, guess),
         None if guess is None else origin,
-        stages=HARDENING_STAGES if whole.constrained else 0,
+    )
+
+
+def _schedule(problem: ArmProblem, guess: ArmUnknown | None) -> Schedule:
+    """Load increments and stages of a problem that begins from a guess or from rest."""
+    loaded = problem.loads is not None and not problem.begins_soft
+    hardens = problem.hardens
+    return Schedule(
+        LOAD_INCREMENTS if loaded else 1,
+        HARDENING_STAGES if hardens else 0,
+        SOFT_STAGES if problem.constrained else HARDENING_STAGES,
+        guess is not None or loaded or (hardens and not problem.begins_soft),
     )

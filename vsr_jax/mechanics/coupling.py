@@ -63,15 +63,16 @@ class ArmProblem(NamedTuple):
     couplings: tuple["Coupling", ...]
 
     def with_share(self, share: Array) -> "ArmProblem":
-        """The problem with a fraction of its loads. Constraints are springs up to the fraction 1,
-        with all loads; above it they harden up to 2, where they are exact."""
-        if self.loads is None:
-            return self
-        if not self.constrained:
-            return self._replace(loads=self.loads.scaled(share))
-        hardness = jnp.maximum(share - 1.0, 0.0)
-        softer = self._constraints_by(lambda one: one.softened(hardness))
-        return softer._replace(loads=self.loads.scaled(jnp.minimum(share, 1.0)))
+        """The problem with a fraction of its loads. What hardens is soft up to the fraction 1, with
+        all loads; above it, it hardens up to 2, where it is exact."""
+        problem = self
+        if self.hardens:
+            hardness, share = jnp.maximum(share - 1.0, 0.0), jnp.minimum(share, 1.0)
+            softer = tuple(one.softened(hardness) for one in self.couplings)
+            problem = self._replace(couplings=softer)
+        if problem.loads is None:
+            return problem
+        return problem._replace(loads=problem.loads.scaled(share))
 
     def loosened(self, loose: Array | None) -> "ArmProblem":
         """The problem that is solved where the given one is not, where `loose` is true."""
@@ -143,6 +144,11 @@ class ArmProblem(NamedTuple):
     def constrained(self) -> bool:
         """Whether there are constraints."""
         return bool(self.constraints)
+
+    @property
+    def hardens(self) -> bool:
+        """Whether a coupling is softer on the way to a solution."""
+        return any(one.hardens for one in self.couplings)
 
     @property
     def begins_soft(self) -> bool:
@@ -218,6 +224,8 @@ class Coupling(eqx.Module):
 
     follows_rate: ClassVar[bool] = False
     """Whether the strain and its derivative along the arm give its unknowns."""
+    hardens: ClassVar[bool] = False
+    """Whether it is softer on the way to a solution."""
 
     @abstractmethod
     def guess(self, forces: Forces, grid: Grid) -> PyTree:
@@ -260,6 +268,11 @@ class Coupling(eqx.Module):
         r"""Its unknowns, where it `follows_rate`, from the strain and the derivative $(\xi -
         \xi^*)'$ along the arm, which models with a basis know."""
         raise NotImplementedError
+
+    def softened(self, hardness: Array) -> "Coupling":
+        """The coupling with springs in its place or beside it, from `hardness` 0 up to 1, where it
+        is exact; the same by default."""
+        return self
 
     def prepared(self) -> "Coupling":
         """The coupling with rows whose derivative takes longer to find, and less to apply many
@@ -316,14 +329,10 @@ class Constraint(Coupling):
     """A constraint on the shape of the arm. Its unknowns are forces. On the way to a solution
     springs stand in its place, whose energy shows whether a step is an advance."""
 
+    hardens = True
     begins_soft: ClassVar[bool] = False
     """Whether a solve from rest begins with springs: the exact constraint seldom leads from there
     to a solution."""
-
-    @abstractmethod
-    def softened(self, hardness: Array) -> "Constraint":
-        """The constraint with springs in its place, from `hardness` 0 up to 1, where it is
-        exact."""
 
     @abstractmethod
     def exerts(self, x: PyTree) -> tuple[AppliedLoad, ...]:

@@ -25,6 +25,8 @@ from ..numerics.damped_newton import (
     MAX_TURN,
     Damped,
     Measures,
+    Schedule,
+    Stage,
     damped_newton,
 )
 from ..numerics.implicit import implicit_root
@@ -279,8 +281,8 @@ def _solve(basis: NodalBasis, problem: ArmProblem) -> Root:
     size = K.shape[0]
     elastic = c.single(lu.diagonal(K))
 
-    def evaluate(unknown: GalerkinUnknown, damping: Array, share: Array, _: Array) -> Damped:
-        part = problem.with_share(share)
+    def evaluate(unknown: GalerkinUnknown, damping: Array, stage: Stage) -> Damped:
+        part = problem.with_share(stage.share)
         at = state_of(unknown, basis, part)
         r = imbalance(unknown, at, basis, part)
         J = approximate_tangent(unknown, at, basis, part)
@@ -308,10 +310,11 @@ def _solve(basis: NodalBasis, problem: ArmProblem) -> Root:
     first = start(jnp.zeros((size, *arms), K.dtype), problem)
     first = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(x), *arms)), first)
     floor = jnp.broadcast_to(rounding_of(problem), arms)
-    shares = 1 if problem.loads is None else LOAD_INCREMENTS
+    loaded = problem.loads is not None
+    schedule = Schedule(LOAD_INCREMENTS if loaded else 1, direct=loaded)
     stirs = jax.tree.map(jnp.zeros_like, first)._replace(q=_stirs(K, arms))
     measures = Measures(work, turn, stirs, dot if problem.follows_rate else None)
-    return iterated(damped_newton(evaluate, measures, first, floor, shares))
+    return iterated(damped_newton(evaluate, measures, first, floor, schedule))
 
 
 def _stirs(K: Array, arms: tuple[int, ...]) -> Array:

@@ -9,7 +9,7 @@ load levels and restarts, `probe` the test of stability at the end.
 
 from .continuation import HARDENING_STAGES, LOAD_INCREMENTS, SOFT_STAGES
 from .descent import MAX_TURN
-from .problem import Damped, Measures
+from .problem import Damped, Measures, Schedule, Stage
 from .solver import damped_newton
 
 __all__ = [
@@ -19,5 +19,7 @@ __all__ = [
     "SOFT_STAGES",
     "Damped",
     "Measures",
+    "Schedule",
+    "Stage",
     "damped_newton",
 ]

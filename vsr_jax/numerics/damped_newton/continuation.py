@@ -8,7 +8,7 @@ from jaxtyping import Array
 
 from ..component import select
 from . import convergence, probe, termination
-from .problem import Schedule, Setting
+from .problem import Schedule, Setting, Stage
 from .state import Path, State, Trial, Verdict
 
 LOAD_INCREMENTS = 5
@@ -94,12 +94,12 @@ def next_level(state: State, turn: Array, schedule: Schedule) -> Array:
     return jnp.where(level >= schedule.increments, harder, following)
 
 
-def share(level: Array, schedule: Schedule) -> Array:
-    """Share of the loads at a level, and above 1 that of the stages."""
-    loads = jnp.minimum(level / schedule.increments, 1.0)
-    if not schedule.stages:
-        return loads
-    return loads + jnp.maximum(level - schedule.increments, 0.0) / schedule.stages
+def stage(path: Path, level: Array, schedule: Schedule) -> Stage:
+    """The problem at a level of a path."""
+    share = jnp.minimum(level / schedule.increments, 1.0)
+    if schedule.stages:
+        share = share + jnp.maximum(level - schedule.increments, 0.0) / schedule.stages
+    return Stage(share, path.loose, path.restarted)
 
 
 def without_energy(path: Path, level: Array, schedule: Schedule) -> Array:
@@ -110,7 +110,7 @@ def without_energy(path: Path, level: Array, schedule: Schedule) -> Array:
     evaluations.
     """
     careful = path.restarted | (not schedule.direct)
-    return careful & (level >= schedule.increments + SOFT_STAGES)
+    return careful & (level >= schedule.increments + schedule.soft)
 
 
 def updated(path: Path, trial: Trial, verdict: Verdict) -> Path:

@@ -46,13 +46,24 @@ class Tolerance(NamedTuple):
     step: float
 
 
+class Stage(NamedTuple):
+    """The problem that is evaluated: `share` of the loads, and above 1 that of the stages; whether
+    it is the `loose` one, and whether it is one of a second attempt, `restarted`."""
+
+    share: Array
+    loose: Array
+    restarted: Array
+
+
 class Schedule(NamedTuple):
     """Levels of a problem: the loads come in equal `increments`, then constraints harden in some
-    `stages`. In a `direct` first attempt all of this is applied at once."""
+    `stages`, in the first `soft` of which the problem has an energy. In a `direct` first attempt
+    all of this is applied at once."""
 
-    increments: int
-    stages: int
-    direct: bool
+    increments: int = 1
+    stages: int = 0
+    soft: int = 0
+    direct: bool = False
 
     @property
     def last(self) -> int:

@@ -13,7 +13,7 @@ from ..component import select
 from ..newton import Root
 from ..once import once
 from . import acceptance, continuation, convergence, descent, probe, termination
-from .problem import Damped, Measures, Schedule, Setting, Tolerance
+from .problem import Damped, Measures, Schedule, Setting, Stage, Tolerance
 from .state import State, Trial, Verdict
 
 _ACCEPTED = 64
@@ -21,14 +21,12 @@ _ACCEPTED = 64
 
 
 def damped_newton(
-    evaluate: Callable[[Any, Array, Array, Array], Damped],
+    evaluate: Callable[[Any, Array, Stage], Damped],
     measures: Measures,
     start: Any,
     floor: Array,
-    increments: int = 1,
+    schedule: Schedule,
     origin: Any = None,
-    *,
-    stages: int = 0,
 ) -> Iteration:
     r"""Root of a residual that is the gradient of an energy, or nearly so, by Newton's method with
     Levenberg damping.
@@ -37,10 +35,10 @@ def damped_newton(
     implicit time step of a creeping arm. The damping $\mu$ rises until the tangent is positive
     definite and the step is accepted, and falls with every accepted step.
 
-    First all loads are applied at once, without damping. Where that fails, the problem begins again
-    from `origin`, and load increments lead to it (see `continuation`). With neither increments nor
-    an `origin` the loads come at once, with a damping. With `stages`, springs stand for constraints
-    first; they harden level by level, and are exact at the last one.
+    In a direct first attempt all loads are applied at once, without damping. Where it fails, the
+    problem begins again from `origin`, and load increments lead to it (see `continuation`). A
+    careful one begins with a damping. With stages, springs stand for constraints first; they harden
+    level by level, and are exact at the last one.
 
     The iteration ends where the step is undamped, the residual is accepted, and the sum of all
     steps to come is negligible (see `termination`). A residual that is not accepted never ends it
@@ -51,14 +49,12 @@ def damped_newton(
     damping and level, and stops when it is done.
 
     **Arguments:**
-    - `evaluate`: maps a point, a damping $\mu$, the fraction of the loads and whether the problem
-      is loosened, which may be another one, to `Damped`.
+    - `evaluate`: maps a point, a damping $\mu$ and a stage of the problem to `Damped`.
     - `measures`: of steps.
     - `floor`: size of the residual that counts as rounding, one entry per problem.
-    - `increments`: number of load increments.
+    - `schedule`: load increments, and stages after them, each of which begins once the problem
+      before it is nearly solved.
     - `origin`: where the second attempt begins, the start by default.
-    - `stages`: further increments after the loads, each once the problem before it is nearly
-      solved: of constraints that are springs first and exact in the last one.
 
     **Returns:** the `Iteration`, whose result is a `Root`: it is converged if the residual is
     rounding or as small as a negligible step.
@@ -67,7 +63,7 @@ def damped_newton(
     setting = Setting(
         measures,
         Tolerance(rounding=floor, accepted=jnp.maximum(_ACCEPTED * floor, small), step=small),
-        Schedule(increments, stages, direct=increments > 1 or origin is not None),
+        schedule,
     )
     method = _Method(
         jax.jit(evaluate, inline=True),  # traced once for its shapes and in the loop
@@ -82,7 +78,7 @@ def damped_newton(
 class _Method(NamedTuple):
     """The method with its arguments, and how the `first` and the `second` attempt begin."""
 
-    evaluate: Callable[[Any, Array, Array, Array], Damped]
+    evaluate: Callable[[Any, Array, Stage], Damped]
     setting: Setting
     start: Any
     origin: Any
@@ -93,8 +89,8 @@ class _Method(NamedTuple):
         """The first state; `like`: any other one, None if there is none yet."""
         if like is None:
             nothing = jnp.zeros_like(self.first.damping)
-            given = self.start, nothing, nothing, self.first.path.loose
-            step = jax.eval_shape(self.evaluate, *given).step
+            stage = continuation.stage(self.first.path, nothing, self.setting.schedule)
+            step = jax.eval_shape(self.evaluate, self.start, nothing, stage).step
         else:
             step = like.step
         step = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), step)
@@ -163,8 +159,7 @@ class _Method(NamedTuple):
         new = self.evaluate(
             point,
             jnp.where(probing, probe.DAMPING, damping),
-            continuation.share(level, schedule),
-            state.path.loose,
+            continuation.stage(state.path, level, schedule),
         )
         return Trial(
             solving=solving,
