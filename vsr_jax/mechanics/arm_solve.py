@@ -23,6 +23,7 @@ from ..numerics.batching import (
 )
 from ..numerics.component import Vector, free_components, spread
 from ..numerics.damped_newton import (
+    FIRST_DAMPING,
     HARDENING_STAGES,
     LOAD_INCREMENTS,
     MAX_TURN,
@@ -325,10 +326,10 @@ def _iteration(
 def _schedule(problem: ArmProblem, guess: ArmUnknown | None) -> Schedule:
     """Load increments and stages of a problem that begins from a guess or from rest."""
     loaded = problem.loads is not None and not problem.begins_soft
-    hardens = problem.hardens
     return Schedule(
         LOAD_INCREMENTS if loaded else 1,
-        HARDENING_STAGES if hardens else 0,
+        HARDENING_STAGES if problem.hardens else 0,
         SOFT_STAGES if problem.constrained else HARDENING_STAGES,
-        guess is not None or loaded or (hardens and not problem.begins_soft),
+        direct=guess is not None or loaded or (problem.hardens and not problem.begins_soft),
+        damping=0.0 if guess is not None or loaded else FIRST_DAMPING,
     )

@@ -7,12 +7,13 @@ whether a step is accepted and the damping, `termination` when a problem is done
 load levels and restarts, `probe` the test of stability at the end.
 """
 
-from .continuation import HARDENING_STAGES, LOAD_INCREMENTS, SOFT_STAGES
+from .continuation import FIRST_DAMPING, HARDENING_STAGES, LOAD_INCREMENTS, SOFT_STAGES
 from .descent import MAX_TURN
 from .problem import Damped, Measures, Schedule, Stage
 from .solver import damped_newton
 
 __all__ = [
+    "FIRST_DAMPING",
     "HARDENING_STAGES",
     "LOAD_INCREMENTS",
     "MAX_TURN",

@@ -17,7 +17,7 @@ tangent is often indefinite at the start under all loads."""
 SOFT_STAGES, HARDENING_STAGES = 1, 4
 """Number of levels after the loads with springs in place of constraints, which have an energy, and
 of all by which constraints harden in `damped_newton`."""
-_FIRST_DAMPING = 1.0
+FIRST_DAMPING = 1.0
 """Damping to begin with where all loads are one increment."""
 _FIRST_STAGES = 100
 """Bound on the evaluations of the first careful attempt where there are stages."""
@@ -54,12 +54,12 @@ def attempts(like: Array, schedule: Schedule) -> tuple[Attempt, Attempt]:
     """
     no = jnp.zeros(like.shape, bool)
     path = Path(jnp.ones_like(like), no, no, jnp.zeros(like.shape, jnp.int32))
-    first = 0.0 if schedule.increments > 1 else _FIRST_DAMPING
+    first = 0.0 if schedule.increments > 1 else FIRST_DAMPING
     careful = Attempt(jnp.full_like(like, first), path)
     again = path._replace(restarted=~no)
     if schedule.direct:
         whole = path._replace(level=jnp.full_like(like, schedule.last))
-        return Attempt(jnp.zeros_like(like), whole), careful._replace(path=again)
+        return Attempt(jnp.full_like(like, schedule.damping), whole), careful._replace(path=again)
     slow = again._replace(level=again.level + _HARDER, loose=~no)
     return careful, Attempt(jnp.full_like(like, _SLOW_DAMPING), slow)
 

@@ -58,12 +58,13 @@ class Stage(NamedTuple):
 class Schedule(NamedTuple):
     """Levels of a problem: the loads come in equal `increments`, then constraints harden in some
     `stages`, in the first `soft` of which the problem has an energy. In a `direct` first attempt
-    all of this is applied at once."""
+    all of this is applied at once, first with a `damping`."""
 
     increments: int = 1
     stages: int = 0
     soft: int = 0
     direct: bool = False
+    damping: float = 0.0
 
     @property
     def last(self) -> int:
