@@ -36,9 +36,11 @@ from vsr_jax.mechanics.resolution import COARSE
 
 try:
     from benchmarks import load_steps
+    from benchmarks.held_minimum import HeldArm
     from benchmarks.ordinary_scenes import STRUCTURES, Numbers, Structure, built
 except ModuleNotFoundError:  # as a script
     import load_steps
+    from held_minimum import HeldArm
     from ordinary_scenes import STRUCTURES, Numbers, Structure, built
 
 STEPS = 16
@@ -50,12 +52,14 @@ SAME = 0.02
 
 
 class Answer(NamedTuple):
-    """Status, tip [m], strains at the middles of the elements, and forces [N] of the tendons."""
+    """Status, tip [m], strains at the middles of the elements, forces [N] of the tendons, and force
+    [N] and moment [N m] of the support, zero without one."""
 
     status: Any
     tip: Any
     strain: Any
     forces: Any
+    support: Any
 
 
 @partial(jax.jit, static_argnums=0)
@@ -65,7 +69,8 @@ def answers(structure: Structure, draws: dict[str, jax.Array]) -> Answer:
     def answer(numbers: Numbers) -> Answer:
         eq = vsr.solve(*built(structure, numbers), model=vsr.StrainDependent(STEPS))
         X = (jnp.arange(load_steps.ELEMENTS) + 0.5) / load_steps.ELEMENTS * eq.scene.rod.length
-        return Answer(eq.status, eq.tip[:3, 3], eq.strain(X), eq.forces)
+        held = jnp.roll(eq.supports[0], 3) if structure.held else jnp.zeros(6)
+        return Answer(eq.status, eq.tip[:3, 3], eq.strain(X), eq.forces, held)
 
     return jax.vmap(answer)(draws)
 
@@ -92,6 +97,8 @@ def drawn(structure: Structure, count: int, seed: int) -> list[Numbers]:
 
 def sought(structure: Structure, numbers: Numbers) -> tuple[str, dict[str, Any]]:
     """Verdict of the independent path on a draw that failed, and where the path ended."""
+    if structure.held:
+        return _sought_held(structure, numbers)
     arm = load_steps.Arm(structure, numbers)
     path = arm.follow()
     turn, tip = arm.turn(path.strain), arm.tip(path.strain)
@@ -119,6 +126,8 @@ def sought(structure: Structure, numbers: Numbers) -> tuple[str, dict[str, Any]]
 def confirmed(structure: Structure, numbers: Numbers, answer: Answer) -> tuple[str, dict[str, Any]]:
     """Verdict on a converged shape: whether the independent code stays there, if necessary on a
     finer mesh; and the bending of the arm."""
+    if structure.held:
+        return _confirmed_held(structure, numbers, answer)
     L, record = numbers["length"], {}
     unit = numbers["young"] * np.pi * numbers["radius"] ** 4 / 4 / L**2
     for finer in (1, 4):
@@ -140,6 +149,39 @@ def confirmed(structure: Structure, numbers: Numbers, answer: Answer) -> tuple[s
             f"{said}, beyond a turn" if said == "converged" and record["turn"] > A_TURN else said
         ), record
     return "wrong: another shape", record
+
+
+def _sought_held(structure: Structure, numbers: Numbers) -> tuple[str, dict[str, Any]]:
+    """Verdict of the independent minima on a draw of a held arm that failed."""
+    arm = HeldArm(structure, numbers)
+    found = arm.search()
+    if found is None:
+        return "no minimum found", {"turn": math.nan}
+    record = {"turn": arm.turn(found.strain), "margin": found.margin}
+    if record["turn"] > A_TURN:
+        return "beyond a turn", record
+    fine = HeldArm(structure, numbers, 2 * arm.count)
+    there = fine.finished(np.repeat(found.strain, 2, axis=0), found.force)
+    same = there is not None and there.margin > 0
+    return ("false failure" if same else "in doubt"), record
+
+
+def _confirmed_held(
+    structure: Structure, numbers: Numbers, answer: Answer
+) -> tuple[str, dict[str, Any]]:
+    """Verdict on a converged shape of a held arm."""
+    L, arm = numbers["length"], HeldArm(structure, numbers, load_steps.ELEMENTS)
+    unit = numbers["young"] * np.pi * numbers["radius"] ** 4 / 4 / L**2
+    force = answer.support / unit / np.array([1, 1, 1, L, L, L])
+    strain = answer.strain * np.array([L, L, L, 1, 1, 1])
+    record = {"turn": arm.turn(strain)}
+    found = arm.finished(strain, force[: arm.rows])
+    if found is None or np.max(np.abs(arm.places(found.strain) - arm.places(strain))) > COARSE:
+        return "wrong: another shape", record
+    record["margin"] = found.margin
+    if found.margin <= 0:
+        return "wrong: not stable", record
+    return ("converged, beyond a turn" if record["turn"] > A_TURN else "converged"), record
 
 
 def search(name: str, count: int, seed: int, gradients: bool = False) -> dict[str, Any]:

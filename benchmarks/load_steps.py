@@ -151,7 +151,7 @@ class Arm:
     def poses(self, xi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Poses at the start of each element and at the tip (N + 1), and at the middle of each (N),
         shape (., 4, 4)."""
-        whole, half = _exp(self.h * xi), _exp(0.5 * self.h * xi)
+        whole, half = twists(self.h * xi), twists(0.5 * self.h * xi)
         ends = np.empty((self.count + 1, 4, 4))
         ends[0] = np.eye(4)
         for i, step in enumerate(whole):
@@ -183,7 +183,7 @@ class Arm:
             B = np.concatenate([np.cross(d, t), t], 1)
             r += T * share[:, None] * B
             across = (np.eye(3) - t[:, :, None] * t[:, None]) / size[:, None, None]
-            lever = np.concatenate([-_skew(d), np.broadcast_to(np.eye(3), (N, 3, 3))], 2)
+            lever = np.concatenate([-skew(d), np.broadcast_to(np.eye(3), (N, 3, 3))], 2)
             H += (T * share)[:, None, None] * np.swapaxes(lever, 1, 2) @ across @ lever
             if i in self.driven:
                 columns.append((h * share[:, None] * B).reshape(-1))
@@ -229,16 +229,16 @@ class Arm:
         N = self.count
         if not len(self.element):
             return np.zeros((N, 6)), *(np.zeros((N, 6, 6)) for _ in range(3))
-        g = ends[self.element] @ _exp((self.before * self.h)[:, None] * xi[self.element])
+        g = ends[self.element] @ twists((self.before * self.h)[:, None] * xi[self.element])
         R, r = g[:, :3, :3], g[:, :3, 3]
         follow = self.follows[:, None]
         f = s * np.where(follow, np.einsum("nij,nj->ni", R, self.force), self.force)
         m = s * np.where(follow, np.einsum("nij,nj->ni", R, self.moment), self.moment)
         w = np.concatenate([m + np.cross(r, f), f], 1)
         D = np.where(self.follows[:, None, None], -_turned(w), 0.0)
-        F, zero = _skew(f), np.zeros((len(w), 3, 3))
+        F, zero = skew(f), np.zeros((len(w), 3, 3))
         dead = np.concatenate(
-            [np.concatenate([F @ _skew(r), -F], 2), np.concatenate([zero, zero], 2)], 1
+            [np.concatenate([F @ skew(r), -F], 2), np.concatenate([zero, zero], 2)], 1
         )
         D = np.where(self.follows[:, None, None], D, dead)
         W = self.beyond @ w
@@ -320,7 +320,8 @@ def _lower(count: int) -> np.ndarray:
     return place[:, None] > place
 
 
-def _skew(v: np.ndarray) -> np.ndarray:
+def skew(v: np.ndarray) -> np.ndarray:
+    """Matrices of vector products."""
     x, y, z = np.moveaxis(v, -1, 0)
     zero = np.zeros_like(x)
     return np.stack(
@@ -330,16 +331,16 @@ def _skew(v: np.ndarray) -> np.ndarray:
 
 def _adjoint(g: np.ndarray) -> np.ndarray:
     R, r = g[:, :3, :3], g[:, :3, 3]
-    return np.concatenate([np.concatenate([R, 0 * R], 2), np.concatenate([_skew(r) @ R, R], 2)], 1)
+    return np.concatenate([np.concatenate([R, 0 * R], 2), np.concatenate([skew(r) @ R, R], 2)], 1)
 
 
 def _turned(w: np.ndarray) -> np.ndarray:
     """Matrix that maps a twist to the change of a wrench, $ad(\\eta)^T w$."""
-    M, F = _skew(w[:, :3]), _skew(w[:, 3:])
+    M, F = skew(w[:, :3]), skew(w[:, 3:])
     return np.concatenate([np.concatenate([M, F], 2), np.concatenate([F, 0 * F], 2)], 1)
 
 
-def _exp(x: np.ndarray) -> np.ndarray:
+def twists(x: np.ndarray) -> np.ndarray:
     """Poses of twists, by Rodrigues' formula."""
     k, u = x[:, :3], x[:, 3:]
     square = np.sum(k**2, 1)[:, None, None]
@@ -355,7 +356,7 @@ def _exp(x: np.ndarray) -> np.ndarray:
         np.where(small, 0.5 - square / 24, b),
         np.where(small, 1 / 6 - square / 120, c),
     )
-    K = _skew(k)
+    K = skew(k)
     g = np.zeros((len(x), 4, 4))
     g[:, 3, 3] = 1
     g[:, :3, :3] = np.eye(3) + a * K + b * (K @ K)

@@ -17,6 +17,7 @@ from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 import vsr_jax as vsr
 
@@ -42,13 +43,15 @@ class Laid(NamedTuple):
 
 
 class Structure(NamedTuple):
-    """Structure of a scene: tendons; gravity; wrenches by name, see `_loads`; and the function that
-    draws its numbers."""
+    """Structure of a scene: tendons; gravity; wrenches by name, see `_loads`; the function that
+    draws its numbers; how its tip is held; and whether there are obstacles that it cannot reach."""
 
     tendons: tuple[Laid, ...] = ()
     gravity: bool = False
     wrenches: tuple[str, ...] = ()
     draw: Callable[["Structure", np.random.Generator], Numbers] | None = None
+    held: Literal["pinned", "clamped"] | None = None
+    beside: bool = False
 
     def numbers(self, random: np.random.Generator) -> Numbers:
         """One draw."""
@@ -78,9 +81,17 @@ def built(structure: Structure, numbers: Numbers, share: Any = 1.0) -> tuple[vsr
                 motion=laid.motion or "pull",
             )
         )
-    return vsr.Scene(rod, tendons, _loads(structure, n, share)), share * n[
-        "inputs"
-    ] if tendons else jnp.zeros(0)
+    around: dict[str, Any] = {}
+    if structure.held:
+        clamped = structure.held == "clamped"
+        turn = n["end rotation"] if clamped else None
+        around["held"] = vsr.Held(position=n["length"] * n["end"], orientation=turn)
+    if structure.beside:
+        L = n["length"]
+        side = jnp.array([0.0, 0.0, -3.0])
+        around["obstacles"] = [vsr.Plane((0, 0, 1), side * L), vsr.Sphere(-side * L, L)]
+    scene = vsr.Scene(rod, tendons, _loads(structure, n, share), **around)
+    return scene, share * n["inputs"] if tendons else jnp.zeros(0)
 
 
 def _loads(structure: Structure, n: Numbers, share: Any) -> list[Any]:
@@ -219,6 +230,90 @@ def upright(structure: Structure, random: np.random.Generator) -> Numbers:
     )
 
 
+def taut(structure: Structure, random: np.random.Generator) -> Numbers:
+    """A straight arm of any slenderness whose tip is held where it is at rest or up to 0.1 %
+    farther away, with its weight and a load across."""
+    numbers = _held(structure, random, random.uniform(np.log10(5), np.log10(15_800)))
+    stretch = 10 ** random.uniform(-9, -3)
+    return plain(numbers | {"end": np.array([1 + stretch, 0, 0]), "end rotation": np.eye(3)})
+
+
+def slack(structure: Structure, random: np.random.Generator) -> Numbers:
+    """A straight arm whose tip is held nearer to its base and aside, turned by up to a third of a
+    turn where it is clamped, with its weight and a load across."""
+    numbers = _held(structure, random, random.uniform(1, np.log10(3000)))
+    aside = np.array([1.0, *(0.5 * random.uniform(-1, 1, 2))])
+    end = (1 - random.uniform(0.01, 0.4)) * aside / np.linalg.norm(aside)
+    turn = Rotation.from_rotvec(_direction(random) * random.uniform(0, 2)).as_matrix()
+    return plain(numbers | {"end": end, "end rotation": turn})
+
+
+def _held(structure: Structure, random: np.random.Generator, slender: float) -> Numbers:
+    """Numbers of an arm without curvature or moments, its loads up to 20 EI / L^3 per length."""
+    numbers = {name: np.asarray(value) for name, value in ordinary(structure, random).items()}
+    length = numbers["length"]
+    radius, young = length / 10**slender, numbers["young"]
+    bending = young * np.pi * radius**4 / 4
+    unit = bending / length**3
+    weight = _direction(random) * MOST_WEIGHT * random.random() ** 2 * unit
+    numbers |= {
+        "radius": radius,
+        "tip_radius": radius,
+        "guide_radius": radius,
+        "curvature": np.zeros(2),
+        "gravity": weight / (DENSITY * np.pi * radius**2),
+    }
+    for name in structure.wrenches:
+        numbers[f"{name} force"] = _direction(random) * random.uniform(0, 20) * unit
+        numbers[f"{name} moment"] = np.zeros(3)
+    return numbers
+
+
+def limp(structure: Structure, random: np.random.Generator) -> Numbers:
+    """A hanging rope with a weight from 10 to 1e5 EI / L^3 and a small force across its tip."""
+    numbers = {name: np.asarray(value) for name, value in ordinary(structure, random).items()}
+    length, radius = numbers["length"], numbers["radius"]
+    unit = numbers["young"] * np.pi * radius**4 / 4 / length**3
+    weight = 10 ** random.uniform(1, 5) * unit
+    across = np.array([0.0, *random.normal(size=2)])
+    return plain(
+        numbers
+        | {
+            "tip_radius": radius,
+            "curvature": np.zeros(2),
+            "gravity": np.array([weight / (DENSITY * np.pi * radius**2), 0, 0]),
+            "tip world force": 1e-3 * weight * length * across,
+            "tip world moment": np.zeros(3),
+        }
+    )
+
+
+def antagonistic(structure: Structure, random: np.random.Generator) -> Numbers:
+    """Elastic cables around an arm that are all taut: each shorter by its own stretch and that of
+    the arm under a common tension, up to half of what buckles the arm."""
+    numbers = {name: np.asarray(value) for name, value in ordinary(structure, random).items()}
+    count, length, radius = len(structure.tendons), numbers["length"], numbers["radius"]
+    young, place = numbers["young"], np.full(count, 0.9 * numbers["guide_radius"])
+    axial, bending = young * np.pi * radius**2, young * np.pi * radius**4 / 4
+    phase = 2 * np.pi * np.arange(count) / count
+    angle, plane = 2.5 * random.random(), random.uniform(0, 2 * np.pi)
+    tension = 0.5 * random.random() * min(np.pi**2 * bending / length**2, 0.2 * axial) / count
+    stiffness = axial * 10 ** random.uniform(-2, 1, count)
+    taut = tension * length * (1 / stiffness + count / axial)
+    return plain(
+        numbers
+        | {
+            "tip_radius": radius,
+            "curvature": np.zeros(2),
+            "place": place,
+            "phase": phase,
+            "turns": np.full(count, PARALLEL),
+            "stiffness": stiffness,
+            "inputs": -place * angle * np.cos(phase - plane) - taut,
+        }
+    )
+
+
 def _direction(random: np.random.Generator) -> np.ndarray:
     vector = random.normal(size=3)
     return vector / np.linalg.norm(vector)
@@ -230,6 +325,7 @@ def plain(numbers: Numbers) -> Numbers:
 
 
 TENSION, WOUND, LENGTH = Laid(), Laid(winds=True), Laid("length")
+ELASTIC, SPREAD = Laid("length", elastic=True), ("spread world",)
 
 STRUCTURES = {
     "tip wrench and gravity": Structure((), True, ("tip world",)),
@@ -254,4 +350,11 @@ STRUCTURES = {
     "friction, lengths": Structure(
         (Laid("length", motion="pull"), Laid("length", motion="pull", winds=True), TENSION), True
     ),
+    "antagonistic lengths": Structure((ELASTIC,) * 4, True, (), antagonistic),
+    "beside obstacles": Structure((TENSION,) * 2, True, ("tip world",), beside=True),
+    "limp ropes beside obstacles": Structure((), True, ("tip world",), limp, beside=True),
+    "held, taut, pinned": Structure((), True, SPREAD, taut, "pinned"),
+    "held, taut, clamped": Structure((), True, SPREAD, taut, "clamped"),
+    "held, slack, pinned": Structure((), True, SPREAD, slack, "pinned"),
+    "held, slack, clamped": Structure((), True, SPREAD, slack, "clamped"),
 }
