@@ -240,12 +240,18 @@ def taut(structure: Structure, random: np.random.Generator) -> Numbers:
 
 def slack(structure: Structure, random: np.random.Generator) -> Numbers:
     """A straight arm whose tip is held nearer to its base and aside, turned by up to a third of a
-    turn where it is clamped, with its weight and a load across."""
+    turn where it is clamped, with its weight and a load across; in half of the draws all of it in
+    one plane."""
     numbers = _held(structure, random, random.uniform(1, np.log10(3000)))
     aside = np.array([1.0, *(0.5 * random.uniform(-1, 1, 2))])
-    end = (1 - random.uniform(0.01, 0.4)) * aside / np.linalg.norm(aside)
-    turn = Rotation.from_rotvec(_direction(random) * random.uniform(0, 2)).as_matrix()
-    return plain(numbers | {"end": end, "end rotation": turn})
+    turn, short = _direction(random) * random.uniform(0, 2), random.uniform(0.01, 0.4)
+    if random.random() < 0.5:
+        aside[1], turn[::2] = 0.0, 0.0
+        for name in ("gravity", *(f"{wrench} force" for wrench in structure.wrenches)):
+            numbers[name] = numbers[name] * np.array([1.0, 0.0, 1.0])
+    end = (1 - short) * aside / np.linalg.norm(aside)
+    turned = Rotation.from_rotvec(turn).as_matrix()
+    return plain(numbers | {"end": end, "end rotation": turned})
 
 
 def _held(structure: Structure, random: np.random.Generator, slender: float) -> Numbers:

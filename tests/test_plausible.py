@@ -63,6 +63,10 @@ def arm(
             "rod.material.young: 0.2 Pa; materials have 1 kPa to 2 TPa; is it in MPa or GPa?",
         ),
         (
+            {"young": 1.5, "shear": 22e3},
+            "rod.material.young: 1.5 Pa; materials have 1 kPa to 2 TPa; is it in MPa or GPa?",
+        ),
+        (
             {"young": vsr.Taper(54.0, 60.0)},
             "rod.material.young: 54 Pa; materials have 1 kPa to 2 TPa; is it in MPa or GPa?",
         ),
@@ -86,6 +90,41 @@ def test_a_wrong_unit_is_named(numbers, sentence):
     found = plausible.warnings_of(arm(**numbers))
     assert len(found) == 1
     assert found[0].startswith(sentence)
+
+
+@pytest.mark.parametrize(
+    ("acceleration", "sentence"),
+    [
+        ((0, 0, 9.81), "loads[0].acceleration: points up, along +z; is its sign right?"),
+        (
+            (0, 0, -9810.0),
+            "loads[0].acceleration: 9810 m/s^2; the Earth's is 9.81 m/s^2; is it in mm/s^2?",
+        ),
+    ],
+    ids=["up", "large"],
+)
+def test_doubtful_gravity_is_named(acceleration, sentence):
+    scene = arm()
+    heavy = vsr.Scene(scene.rod, scene.actuators, vsr.Gravity(acceleration))
+    assert plausible.warnings_of(heavy) == (sentence,)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("aside", [0.0, 0.008])
+def test_a_tension_beyond_what_the_arm_bears_is_named(aside):
+    """First-order strain: $T / EA$, or $T d b / EI$ at the outline of a section."""
+    rod = arm().rod
+    scene = vsr.Scene(rod, [vsr.Tendon(vsr.Parallel(aside, 0.0))])
+    area, bending = jnp.pi * 0.01**2, 1e6 * jnp.pi / 4 * 0.01**4
+    tension = 5000.0
+    strain = max(tension / (1e6 * area), tension * aside * 0.01 / bending)
+    eq = vsr.solve(scene, [tension], model=vsr.StrainDependent(4))
+    assert not eq.converged
+    (sentence,) = plausible.strain_warnings(eq)
+    assert sentence.startswith(f"inputs[0]: 5000 N would strain a section by {strain:.2g}; ")
+    assert sentence.endswith("is it in mN?")
+    fine = vsr.solve(scene, [tension * 1e-3], model=vsr.StrainDependent(4))
+    assert plausible.strain_warnings(fine) == ()
 
 
 @pytest.mark.slow
@@ -118,7 +157,7 @@ def test_large_strains_are_named_and_failed_or_traced_solves_are_not(helix):
     assert plausible.strain_warnings(solved(0.4)) == ()
     (sentence,) = plausible.strain_warnings(solved(0.8))
     assert sentence.startswith("strain: up to 0.8; beyond 0.5 a linear material is doubtful")
-    assert plausible.strain_warnings(solved(-2.0)) == ()
+    assert plausible.strain_warnings(solved(-1.5)) == ()
     said = []
     jax.jit(
         lambda u: said.extend(

@@ -1,8 +1,9 @@
 r"""Warnings about implausible numbers, most often a wrong unit: millimetres for metres, MPa for Pa.
 
-Checked are length, half thickness b, slenderness L / b, moduli, density, chamber areas and, for a
-solved arm, the largest strain $\max(b\,|k - k^*|, |u - u^*|)$, above which a linear material is
-doubtful. No number is rejected here.
+Checked are length, half thickness b, slenderness L / b, moduli, density, chamber areas, gravity
+and, for a solved arm, the largest strain $\max(b\,|k - k^*|, |u - u^*|)$, above which a linear
+material is doubtful. Each input is checked by the strain that it alone would cause in a section
+that stays as it is, $\Sigma^{-1} b_i \tau_i$. No number is rejected here.
 """
 
 from collections.abc import Iterator
@@ -13,14 +14,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PyTree
 
+from ..arm.loads import Gravity
 from ..arm.scene import Scene
+from ..mechanics.balance import thread_direction, thread_wrench
 from ..numerics.compiling import program
+from ..numerics.component import times
 from ..solution.equilibrium import Equilibrium
 from ..validation import is_traced
 
 LARGEST_STRAIN = 0.5
 """Strains of soft silicone stay below it at working loads."""
 
+_FAR = 4 * LARGEST_STRAIN
+"""Strain by one input above which it is doubted."""
 _STATIONS = 17
 """Stations along the arm: profiles are smooth, so few are enough for a warning."""
 
@@ -74,6 +80,7 @@ _LENGTH = _Range(1e-3, 20.0, "m", "arms are {} long", _METRIC)
 _THICKNESS = _Range(5e-6, 0.5, "m", "arms have {}", _METRIC)
 _SLENDERNESS = _Range(3.0, 1e4, "times", "rods are {}")
 _MODULUS = _Range(1e3, 2e12, "Pa", "materials have {}", ((1e6, "MPa"), (1e9, "GPa")))
+_GRAVITY = _Range(0.0, 100.0, "m/s^2", "the Earth's is 9.81 m/s^2", ((1e-3, "mm/s^2"),))
 _DENSITY = _Range(50.0, 25000.0, "kg/m^3", "materials have {}", ((1e3, "g/cm^3"),))
 
 _RANGES = {
@@ -101,10 +108,12 @@ def warnings_of(scene: Scene) -> tuple[str, ...]:
 
 
 def strain_warnings(eq: Equilibrium) -> tuple[str, ...]:
-    """A sentence if strains of a solved arm are too large for a linear material; none for traced or
-    failed solves."""
-    if _unknown(eq) or jnp.ndim(eq.status) or not bool(eq.converged):
+    """Sentences about inputs that strain an arm far too much, or one if the strains of a solved arm
+    are too large for a linear material; none for traced solves."""
+    if _unknown(eq) or jnp.ndim(eq.status):
         return ()
+    if not bool(eq.converged):
+        return tuple(_doubtful_inputs(eq))
     largest = float(_largest_strain(eq))
     if largest <= LARGEST_STRAIN:
         return ()
@@ -134,12 +143,38 @@ def _doubts(scene: Scene) -> Iterator[str]:
             "are length and sizes in one unit?"
         )
     yield from _moduli(measures.material)
+    yield from _gravities(scene)
     for i, actuator in enumerate(scene.actuators):
         area, most = actuator.pressure_area, np.max(measures.area)
         if area is not None and float(area) > most:
             slip = "; is it in mm^2?" if 1e-6 * float(area) <= most else ""
             yield (
                 f"actuators[{i}].area: {float(area):.6g} m^2; the section has {most:.3g} m^2{slip}"
+            )
+
+
+def _gravities(scene: Scene) -> Iterator[str]:
+    """Warns of gravity that is too large, or points straight up."""
+    for i, load in enumerate(scene.loads):
+        if isinstance(load, Gravity):
+            name, g = f"loads[{i}].acceleration", np.asarray(load.acceleration, float)
+            size = float(np.linalg.norm(g))
+            yield from _GRAVITY.doubts(name, size)
+            if size > 0 and g[2] > 0.999 * size:
+                yield f"{name}: points up, along +z; is its sign right?"
+
+
+def _doubtful_inputs(eq: Equilibrium) -> Iterator[str]:
+    """Warns of inputs that alone would strain a section far too much."""
+    scene = eq.scene
+    largest = np.asarray(_strain_by_inputs(scene, eq.inputs))
+    for i, (actuator, strain) in enumerate(zip(scene.actuators, largest, strict=True)):
+        if strain > _FAR:
+            value, unit = float(eq.inputs[i]), actuator.unit
+            slip = f"; is it in m{unit}?" if unit == "N" and strain < 1e3 * LARGEST_STRAIN else ""
+            yield (
+                f"inputs[{i}]: {value:.6g} {unit} would strain a section by {strain:.2g}; beyond "
+                f"{LARGEST_STRAIN:g} a linear material is doubtful{slip}"
             )
 
 
@@ -170,6 +205,27 @@ def _measured(scene: Scene) -> _Measures:
         )
 
     return jax.vmap(at)(jnp.linspace(0, 1, _STATIONS) * rod.length)
+
+
+@program("check")
+def _strain_by_inputs(scene: Scene, inputs: Array) -> Array:
+    """Largest strain that each input alone causes, to first order; 0 where it drives a law."""
+    rod, zero = scene.rod, jnp.zeros_like(scene.rod.length)
+    X = jnp.linspace(0, 1, _STATIONS) * rod.length
+    sections, forces = scene.sections(X), scene.forces(inputs)
+    thickness = jax.vmap(lambda x: rod.section.clearance(zero, zero, x, rod.length))(X)
+    sizes = [thickness] * 3 + [jnp.ones_like(thickness)] * 3
+
+    def of_thread(i: int) -> Array:
+        if i in scene.law_driven:
+            return zero
+        path = sections.paths[i]
+        wrench = thread_wrench(thread_direction(sections.rest, path)[0], path)
+        parts = zip(sizes, wrench, sections.stiffness, strict=True)
+        unit = jnp.stack([jnp.abs(size * part / k) for size, part, k in parts])
+        return jnp.abs(forces[i]) * jnp.max(times(sections.reach[i], times(sections.flexible, unit)))
+
+    return jnp.stack([of_thread(i) for i in range(len(scene.actuators))])
 
 
 @program("check")
