@@ -121,3 +121,25 @@ def test_a_start_of_other_actuators_is_an_error(scene, near, unchecked):
         solved(other, [3.0], near)
     with pytest.raises(ValueError, match=r"start: got Array"):
         solved(scene, [3.0, 1.5], near.tip)
+
+
+@pytest.mark.slow
+def test_an_arch_that_snaps_says_that_it_left_its_branch():
+    """An arch between a clamp and a pin, pushed up; then up by less, and down."""
+    arch = vsr.Rod(1.0, vsr.Circular(0.01), vsr.Material(1e9, poisson=0.3))
+    unit = 1e9 * np.pi / 4 * 0.01**4
+
+    def pushed(load, start=None):
+        load = vsr.DistributedWrench(force=(0.0, 0.0, load * unit))
+        scene = vsr.Scene(arch, (), load, held=vsr.Held(position=(0.95, 0.0, 0.0)))
+        return vsr.solve(scene, [], model=vsr.StrainDependent(16), start=start, throw=True)
+
+    up = pushed(20.0)
+    assert float(up.position(0.5)[2]) > 0.1
+    held, snapped = pushed(10.0, up), pushed(-10.0, up)
+    assert float(held.position(0.5)[2]) > 0.1
+    assert float(snapped.position(0.5)[2]) < -0.1
+    assert [bool(eq.restarted) for eq in (up, held, snapped)] == [False, False, True]
+    assert "another branch" not in str(held)
+    assert "another branch" in str(snapped)
+    assert "another branch" in snapped.heading[-1]

@@ -223,7 +223,8 @@ def _strain_by_inputs(scene: Scene, inputs: Array) -> Array:
         wrench = thread_wrench(thread_direction(sections.rest, path)[0], path)
         parts = zip(sizes, wrench, sections.stiffness, strict=True)
         unit = jnp.stack([jnp.abs(size * part / k) for size, part, k in parts])
-        return jnp.abs(forces[i]) * jnp.max(times(sections.reach[i], times(sections.flexible, unit)))
+        there = times(sections.reach[i], times(sections.flexible, unit))
+        return jnp.abs(forces[i]) * jnp.max(there)
 
     return jnp.stack([of_thread(i) for i in range(len(scene.actuators))])
 

@@ -67,9 +67,9 @@ def record(eq: Equilibrium, found: Summary | None) -> dict[str, Any]:
     **Arguments:** `eq`: one equilibrium; `found`: its `summary`.
 
     **Returns:** `model`, `precision`, `inputs`, `status` as a message, `converged`, `steps`,
-    `loosened`; `tip` (pose, 4 x 4); at the stations `X` [m] the `position` [m] and the `strain`
-    (k [1/m], u [-]); for each thread the `force` [N] at its start, negative where it pulls, the
-    `length` [m] and the `slack` [m]; `stability`.
+    `loosened`, `restarted`; `tip` (pose, 4 x 4); at the stations `X` [m] the `position` [m] and the
+    `strain` (k [1/m], u [-]); for each thread the `force` [N] at its start, negative where it
+    pulls, the `length` [m] and the `slack` [m]; `stability`.
     """
     solved: dict[str, Any] = dict.fromkeys(
         ("tip", "X", "position", "strain", "force", "length", "slack", "stability")
@@ -96,6 +96,7 @@ def record(eq: Equilibrium, found: Summary | None) -> dict[str, Any]:
         "converged": bool(eq.converged),
         "steps": int(eq.steps),
         "loosened": bool(eq.loosened),
+        "restarted": bool(eq.restarted),
         **solved,
     }
 

@@ -84,7 +84,8 @@ def solve_arm(
             return Root(found, yes, yes, jnp.array(0, jnp.int32))
         together = _QUEUED if _uneven(problem) else TOGETHER
         root = side_by_side(partial(_solve, free), together)(_start(problem, free), guess, problem)
-        return root._replace(x=root.x._replace(xi=free_components(root.x.xi, free)))
+        point = root.x._replace(xi=free_components(root.x.xi, free))
+        return root._replace(x=point, restarted=None if guess is None else root.restarted)
 
     def whole(x: ArmUnknown, problem: ArmProblem) -> ArmUnknown:
         return x._replace(xi=completed(x.xi, problem.sections, free))

@@ -88,8 +88,9 @@ class Nodes(NamedTuple):
 
 class Outcome(NamedTuple):
     """Result of a model's solve: its own state (finite even where it failed), the thread forces [N]
-    at their start, a `Status`, the Newton steps, its nodes, if they are at hand, and whether
-    constraints were loosened on the way, None for a scene or a model without."""
+    at their start, a `Status`, the Newton steps, and its nodes, if they are at hand; whether
+    constraints were loosened on the way, None for a scene or a model without; and whether it gave
+    up the solution near by and began again from rest, None where it did not begin there."""
 
     state: Any
     forces: Forces
@@ -97,6 +98,7 @@ class Outcome(NamedTuple):
     steps: Array
     nodes: Nodes | None = None
     loosened: Array | None = None
+    restarted: Array | None = None
 
 
 class Near(NamedTuple):

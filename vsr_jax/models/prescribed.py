@@ -167,14 +167,14 @@ class Prescribed(SteppedModel):
             return self._solve_together(scene, inputs)
         projection, forces = project(scene, self.basis, self.points), scene.forces(inputs)
         tau = projection.sections.carry(forces)
-        q, balanced, definite, steps, _ = solve_projected(projection, tau)
+        q, balanced, definite, steps, *_ = solve_projected(projection, tau)
         status = classify(projection.strain(q), projection.sections, tau, balanced, definite)
         return Outcome(jnp.where(status == Status.CONVERGED, q, 0.0), forces, status, steps)
 
     def _solve_together(self, scene: Scene, inputs: Float[Array, " inputs"]) -> Outcome:
         problem = problem_of(scene, inputs, self.grid(scene))
         basis = self._at_nodes(scene, problem)
-        unknown, balanced, definite, steps, _ = solve_prescribed(basis, problem)
+        unknown, balanced, definite, steps, *_ = solve_prescribed(basis, problem)
         q, coupled = unknown.q, prescribed_loaded.coupled_of(unknown, basis, problem)
         forces = forces_at(problem.couplings, coupled, problem.forces)
         at = prescribed_loaded.state_of(unknown, basis, problem)

@@ -139,7 +139,7 @@ class StrainDependent(SteppedModel):
         solved: bool = False,
     ) -> Outcome:
         found = solve_arm(problem, scene.free, guess, solved=solved)
-        unknown, balanced, definite, steps, loose = found
+        unknown, balanced, definite, steps, loose, restarted = found
         problem = problem.loosened(loose)
         forces, shares = carried_from_start(unknown, problem)
         tau, sections = problem.along_sections(shared(forces, shares)), problem.sections_of_threads
@@ -150,7 +150,8 @@ class StrainDependent(SteppedModel):
         state = ArmSolution(xi, coupled, problem.couplings)
         nodes = Nodes(problem.grid, xi, problem.sections, shares)
         loosened = problem.was_loosened(loose)
-        return Outcome(state, forces_where(sound, forces), status, steps, nodes, loosened)
+        sound_forces = forces_where(sound, forces)
+        return Outcome(state, sound_forces, status, steps, nodes, loosened, restarted)
 
     def node_strain(self, scene: Scene, state: ArmSolution) -> Vector:
         return state.xi

@@ -42,14 +42,15 @@ class Iterate(NamedTuple):
 
 class Root(NamedTuple):
     """Result of a root search: the point, whether the residual vanishes there, whether the tangent
-    is positive definite there, the number of evaluations, and whether it is that of a loosened
-    problem, where there is one."""
+    is positive definite there, the number of evaluations, whether it is that of a loosened problem,
+    where there is one, and whether the search gave up its start and began again."""
 
     x: Any
     converged: Array
     definite: Array
     steps: Array
     loose: Array | None = None
+    restarted: Array | None = None
 
 
 def newton(evaluate: Callable[[Any], Evaluation], start: Any, floor: Array) -> Iterate:

@@ -36,6 +36,8 @@ from .summary import Summary, summary_of
 
 _LOOSENED = "constraints, on the way to the solution"
 """What a report says of an equilibrium that is `loosened`."""
+_RESTARTED = "from rest: it may lie on another branch than its start"
+"""What a report says of an equilibrium that is `restarted`."""
 
 
 class Equilibrium(Solved):
@@ -60,19 +62,21 @@ class Equilibrium(Solved):
     _forces: Vector
     state: Any
     _loosened: Array | None
+    _restarted: Array | None
 
     def __init__(
         self, scene: Scene, inputs: Float[Array, " inputs"], model: Model, outcome: Outcome
     ):
         self.scene, self.inputs, self.model = scene, inputs, model
         self.state, self._forces, self.status, self.steps = outcome[:4]
-        self._loosened = outcome.loosened
+        self._loosened, self._restarted = outcome.loosened, outcome.restarted
 
     @property
     def outcome(self) -> Outcome:
         """The outcome of its model, from which an equal `Equilibrium` can be made."""
         forces = self.sound_forces
-        return Outcome(self.state, forces, self.status, self.steps, loosened=self._loosened)
+        loosened, restarted = self._loosened, self._restarted
+        return Outcome(self.state, forces, self.status, self.steps, None, loosened, restarted)
 
     @property
     def loosened(self) -> Bool[Array, "..."]:
@@ -87,6 +91,16 @@ class Equilibrium(Solved):
         return self._loosened
 
     @property
+    def restarted(self) -> Bool[Array, "..."]:
+        """Whether the solve gave up its `start` and began again from rest. The answer may then lie
+        on another branch of equilibria: a rod that was twisted beyond its critical angle comes back
+        whole turns away, an arch on its other side. `vsr.follow_branch` follows one branch. Always
+        false without `start`."""
+        if self._restarted is None:
+            return jnp.zeros(jnp.shape(self.status), bool)
+        return self._restarted
+
+    @property
     def message(self) -> str:
         """Message of the status."""
         return Status(int(self.status)).message
@@ -94,11 +108,13 @@ class Equilibrium(Solved):
     @property
     def heading(self) -> tuple[str, ...]:
         """First lines of a report of one equilibrium: its status, its effects and whether it is
-        `loosened`."""
+        `loosened` or `restarted`."""
         method = f"{type(self.model).__name__}, {self.inputs.dtype}, {int(self.steps)} steps"
         effects = ", ".join(self.scene.effects) or "none"
         lines = f"  status     {self.message} ({method})", f"  effects    {effects}"
-        return (*lines, f"  loosened   {_LOOSENED}") if bool(self.loosened) else lines
+        loosened = (f"  loosened   {_LOOSENED}",) if bool(self.loosened) else ()
+        restarted = (f"  restarted  {_RESTARTED}",) if bool(self.restarted) else ()
+        return (*lines, *loosened, *restarted)
 
     def summary(self, X: VectorLike = 61, values: Sequence[str] = ()) -> Summary:
         """All quantities along the arm, from one compiled program, and selected other ones.
@@ -281,6 +297,7 @@ class Equilibrium(Solved):
             return repr(self)
         tip, error = self.tip, self.error.tip
         loosened = (f"  loosened         {_LOOSENED}",) if bool(self.loosened) else ()
+        restarted = (f"  restarted        {_RESTARTED}",) if bool(self.restarted) else ()
         return "\n".join(
             (
                 f"Equilibrium: converged in {int(self.steps)} steps",
@@ -289,6 +306,7 @@ class Equilibrium(Solved):
                 f"  estimated error  {float(error):.1e} m",
                 f"  stability margin {float(self.stability):.3g}",
                 *loosened,
+                *restarted,
             )
         )
 

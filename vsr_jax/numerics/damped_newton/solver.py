@@ -111,6 +111,7 @@ class _Method(NamedTuple):
             probe.stable(state),
             state.evaluations,
             state.path.loose,
+            state.path.restarted,
         )
 
     def advance(self, state: State) -> State:
