@@ -8,7 +8,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, PyTree
 
 from ..numerics import component as c
@@ -34,6 +33,7 @@ from ..numerics.damped_newton import (
     damped_newton,
 )
 from ..numerics.implicit import implicit_root
+from ..numerics.loops import fori_loop
 from ..numerics.newton import Root
 from ..numerics.once import once
 from ..numerics.stacked import components, stack, total
@@ -134,7 +134,7 @@ def _start(problem: ArmProblem, free: tuple[int, ...]) -> ArmUnknown:
         return c.subtract(xi, step), jnp.where(i == 0, size, first), size
 
     none = jnp.zeros((), rest[0].dtype)
-    xi, first, last = lax.fori_loop(0, _START_STEPS, closer, (rest, none, none))
+    xi, first, last = fori_loop(0, _START_STEPS, closer, (rest, none, none))
     near = last <= 0.5 ** (_START_STEPS - 1) * first
     xi = tuple(
         jnp.where(near, x, x0).astype(exact.dtype)

@@ -13,6 +13,7 @@ from jaxtyping import Array
 
 from .compiling import on_cpu
 from .component import select
+from .loops import alike, while_loop
 
 TOGETHER = 136
 """Arms that are solved together on a CPU, at most: the arrays of one pass then stay in the
@@ -161,7 +162,7 @@ class _Queue(NamedTuple):
 
 def iterated(iteration: Iteration) -> Any:
     """The results of all problems at the end."""
-    end = lax.while_loop(
+    end = while_loop(
         lambda state: jnp.any(iteration.busy(state)), iteration.advance, iteration.begin(None)
     )
     return iteration.result(end)
@@ -182,7 +183,7 @@ def queued(iteration: Callable[[Any], Iteration], data: Any, problems: int, lane
         current = iteration(queue.data)
         state = current.advance(queue.state)
         done = (queue.place < problems) & ~current.busy(state)
-        queue = queue._replace(state=state)
+        queue, _ = alike(queue._replace(state=state), data)  # both branches return one type
         return lax.cond(jnp.any(done), refilled, lambda queue, _: queue, queue, done)
 
     def refilled(queue: _Queue, done: Array) -> _Queue:
@@ -196,7 +197,8 @@ def queued(iteration: Callable[[Any], Iteration], data: Any, problems: int, lane
         given = chosen(jnp.minimum(place, problems - 1))
         begins = done & (place < problems)
         state = select(begins, iteration(given).begin(queue.state), queue.state)
-        return _Queue(state, place, given, queue.waiting + jnp.sum(done), results)
+        found = _Queue(state, place, given, queue.waiting + jnp.sum(done), results)
+        return alike(found, queue)[0]
 
     given = chosen(jnp.arange(lanes))
     first = iteration(given)
@@ -204,4 +206,4 @@ def queued(iteration: Callable[[Any], Iteration], data: Any, problems: int, lane
     shapes = jax.eval_shape(first.result, state)
     results = jax.tree.map(lambda x: jnp.zeros((*x.shape[:-1], problems), x.dtype), shapes)
     begin = _Queue(state, jnp.arange(lanes), given, jnp.array(lanes), results)
-    return lax.while_loop(lambda queue: jnp.any(queue.place < problems), advance, begin).results
+    return while_loop(lambda queue: jnp.any(queue.place < problems), advance, begin).results

@@ -18,6 +18,8 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
+from .loops import alike, manual
+
 _FEW = 16
 """Number of terms up to which `total` adds them one by one."""
 
@@ -47,9 +49,17 @@ def cross(a: Array, b: Array) -> Array:
 
 
 def _alike(a: Array, b: Array) -> tuple[Array, Array]:
-    """Both factors in the higher one of their precisions."""
+    """Both factors in the higher one of their precisions, and of one type inside a mesh."""
     dtype = jnp.promote_types(a.dtype, b.dtype)
-    return a.astype(dtype), b.astype(dtype)
+    a, b = alike(a.astype(dtype), b.astype(dtype))
+    return a, b
+
+
+def _of_shape(shape: tuple[int, ...], factor: ShapedArray) -> ShapedArray:
+    """Type of a product of this shape, which inside a mesh varies as its factors do."""
+    if manual():
+        return factor.update(shape=shape, weak_type=False)
+    return ShapedArray(shape, factor.dtype)
 
 
 def _contracted(a: Any, b: Any, *, lead: int, of: tuple[int, int]) -> Array:
@@ -68,7 +78,7 @@ def _shape(a: ShapedArray, b: ShapedArray, *, lead: int, of: tuple[int, int]) ->
         a.shape[:lead] + a.shape[lead + 2 :], b.shape[:lead] + b.shape[lead + 2 :]
     )
     matrix = one[1 - of[0]], other[1 - of[1]]
-    return ShapedArray((*axes[:lead], *matrix, *axes[lead:]), a.dtype)
+    return _of_shape((*axes[:lead], *matrix, *axes[lead:]), a)
 
 
 def _by_first(back: Any, a: Any, b: Any, *, lead: int, of: tuple[int, int]) -> Array:
@@ -97,7 +107,7 @@ def _crossed(a: Any, b: Any, *, lead: int) -> Array:
 def _cross_shape(a: ShapedArray, b: ShapedArray, *, lead: int) -> ShapedArray:
     if len(a.shape) != len(b.shape) or not a.shape[lead] == b.shape[lead] == 3:
         raise TypeError(f"no product of vectors of shapes {a.shape} and {b.shape}")
-    return ShapedArray(np.broadcast_shapes(a.shape, b.shape), a.dtype)
+    return _of_shape(np.broadcast_shapes(a.shape, b.shape), a)
 
 
 def _cross_by_first(back: Any, a: Any, b: Any, *, lead: int) -> Array:
