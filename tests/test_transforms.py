@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 
 import equinox as eqx
@@ -13,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import export
 from jax.flatten_util import ravel_pytree
 from jax.sharding import AxisType, PartitionSpec
 from xla_flags import FLAGS
@@ -373,6 +375,30 @@ def test_arms_on_two_devices_are_those_of_vmap(name):
     deviations = json.loads(done.stdout.splitlines()[-1])
     assert len(deviations) == 6
     assert max(deviations) < 1e-12
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "bare",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("loaded", "in contact", "prescribed")
+        ),
+    ],
+)
+def test_an_exported_batch_has_any_size(name):
+    both = with_slopes(partial(quantities_of(name), 0.3))
+    (size,) = export.symbolic_shape("size")
+    exported = export.export(jax.jit(both))(jax.ShapeDtypeStruct((size, 1), jnp.float64))
+    if find_spec("flatbuffers"):  # JAX needs it to write programs
+        exported = export.deserialize(exported.serialize())
+    inputs = jnp.array([[0.1], [0.2], [1.0]])
+    expected = jax.tree.leaves(jax.jit(both)(inputs))
+    for size in (1, 3):
+        found = jax.tree.leaves(exported.call(inputs[:size]))
+        for x, y in zip(found, expected, strict=True):
+            np.testing.assert_allclose(x, y[:size], rtol=1e-12, atol=1e-14)
 
 
 @pytest.mark.parametrize("half", ["float16", "bfloat16"])

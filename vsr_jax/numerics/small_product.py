@@ -11,13 +11,13 @@ from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
+from ..typing import Shape
 from .loops import alike, manual
 
 _FEW = 16
@@ -55,7 +55,7 @@ def _alike(a: Array, b: Array) -> tuple[Array, Array]:
     return a, b
 
 
-def _of_shape(shape: tuple[int, ...], factor: ShapedArray) -> ShapedArray:
+def _of_shape(shape: Shape, factor: ShapedArray) -> ShapedArray:
     """Type of a product of this shape, which inside a mesh varies as its factors do."""
     if manual():
         return factor.update(shape=shape, weak_type=False)
@@ -74,7 +74,7 @@ def _shape(a: ShapedArray, b: ShapedArray, *, lead: int, of: tuple[int, int]) ->
     one, other = a.shape[lead : lead + 2], b.shape[lead : lead + 2]
     if len(a.shape) != len(b.shape) or one[of[0]] != other[of[1]]:
         raise TypeError(f"no product of matrices of shapes {a.shape} and {b.shape}")
-    axes = np.broadcast_shapes(
+    axes = jnp.broadcast_shapes(
         a.shape[:lead] + a.shape[lead + 2 :], b.shape[:lead] + b.shape[lead + 2 :]
     )
     matrix = one[1 - of[0]], other[1 - of[1]]
@@ -107,7 +107,7 @@ def _crossed(a: Any, b: Any, *, lead: int) -> Array:
 def _cross_shape(a: ShapedArray, b: ShapedArray, *, lead: int) -> ShapedArray:
     if len(a.shape) != len(b.shape) or not a.shape[lead] == b.shape[lead] == 3:
         raise TypeError(f"no product of vectors of shapes {a.shape} and {b.shape}")
-    return _of_shape(np.broadcast_shapes(a.shape, b.shape), a)
+    return _of_shape(jnp.broadcast_shapes(a.shape, b.shape), a)
 
 
 def _cross_by_first(back: Any, a: Any, b: Any, *, lead: int) -> Array:
@@ -118,7 +118,7 @@ def _cross_by_second(back: Any, a: Any, b: Any, *, lead: int) -> Array:
     return _summed_to(b.aval.shape, _cross.bind(back, a, lead=lead))
 
 
-def _summed_to(shape: tuple[int, ...], x: Array) -> Array:
+def _summed_to(shape: Shape, x: Array) -> Array:
     """Sum over the axes along which a factor of a shape was repeated."""
     axes = tuple(i for i, (one, all) in enumerate(zip(shape, x.shape, strict=True)) if one != all)
     return jnp.sum(x, axes, keepdims=True) if axes else x
