@@ -361,6 +361,8 @@ def deviations_of_mapped(name):
 )
 def test_arms_on_two_devices_are_those_of_vmap(name):
     """In a process of its own: the number of devices is set before the first use of JAX."""
+    if name == "in contact" and jax.__version_info__ < (0, 10):
+        pytest.skip("lax.split has no transpose inside shard_map where a part is not used")
     flags = " ".join([*FLAGS, "--xla_force_host_platform_device_count=2"])
     environment = os.environ | {"XLA_FLAGS": flags, "JAX_ENABLE_X64": "1"}
     code = f"import test_transforms as t; print(t.deviations_of_mapped({name!r}))"

@@ -77,7 +77,7 @@ def _axes_of(tree: Any) -> frozenset:
 
 
 def _axes_of_type(of: Any) -> frozenset:
-    """Mesh axes over which arrays of a type vary; JAX has named them in two ways."""
+    """Mesh axes over which arrays of a type vary: `vma` until JAX 0.9."""
     return of.vma if hasattr(of, "vma") else of.mat.varying
 
 
@@ -98,6 +98,6 @@ def _varying(tree: Tree, axes: frozenset) -> Tree:
             return x
         if hasattr(lax, "pcast"):
             return lax.pcast(x, more, to="varying")
-        return lax.pvary(x, more)  # JAX 0.7  # pyright: ignore[reportAttributeAccessIssue]
+        return lax.pvary(x, more)  # until JAX 0.8  # pyright: ignore[reportAttributeAccessIssue]
 
     return jax.tree.map(cast, tree)
