@@ -96,6 +96,22 @@ def test_nothing_private_is_imported(name):
     assert private == []
 
 
+@pytest.mark.parametrize("name", MODULES)
+def test_loops_are_those_of_numerics(name):
+    """Those of `jax.lax` keep the carry's type, which `jax.shard_map` with its check refuses."""
+    if name == "numerics/loops.py":
+        return
+    tree, loops = ast.parse((FOLDER / name).read_text()), {"while_loop", "fori_loop", "scan"}
+    attributes = [n.attr for n in ast.walk(tree) if isinstance(n, ast.Attribute)]
+    imported = [
+        alias.name
+        for n in ast.walk(tree)
+        if isinstance(n, ast.ImportFrom) and (n.module or "").startswith("jax")
+        for alias in n.names
+    ]
+    assert loops.isdisjoint([*attributes, *imported])
+
+
 def test_no_module_is_called_like_a_public_function():
     """`import vsr_jax.arm.load`, say, must not be mistaken for `vsr.load`."""
     modules = {path.stem for path in FOLDER.rglob("*.py")} | set(PACKAGES)

@@ -1,12 +1,23 @@
 """jit, vmap and grad through every result of every model: forward = reverse = finite
 differences."""
 
+import json
+import os
+import subprocess
+import sys
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import export
 from jax.flatten_util import ravel_pytree
+from jax.sharding import AxisType, PartitionSpec
+from xla_flags import FLAGS
 
 import vsr_jax as vsr
 from vsr_jax.studies import paper
@@ -279,6 +290,117 @@ def test_an_empty_batch_of_loaded_scenes_is_empty(name):
     both = jax.vmap(jax.value_and_grad(height))
     value, slope = jax.eval_shape(both, jnp.zeros((0, 1)))
     assert (value.shape, slope.shape) == ((0,), (0, 1))
+
+
+FLOOR = [vsr.Plane((0.0, 0.0, -0.02), (0.0, 0.0, 1.0))]
+BATCHES = {
+    "bare": ([], [], STEPS["strain-dependent"], "tip"),
+    "loaded": ([vsr.Gravity()], [], STEPS["strain-dependent"], "tip"),
+    "in contact": ([vsr.Gravity()], FLOOR, STEPS["strain-dependent"], "tip"),
+    "prescribed": ([vsr.Gravity()], [], STEPS["prescribed"], "tip"),
+    "margin": ([vsr.Gravity()], [], STEPS["strain-dependent"], "stability"),
+}
+"""Loads, obstacles, model and quantity of arms that are solved together."""
+
+
+def quantities_of(name):
+    """A quantity of arms of one length, each with its inputs."""
+    loads, obstacles, model, quantity = BATCHES[name]
+
+    def quantities(length, inputs):
+        rod = vsr.Rod(length, vsr.Circular(0.006), vsr.Material(1e6, poisson=0.45, density=1000.0))
+        scene = vsr.Scene(rod, [vsr.Tendon(vsr.Parallel(0.005, 0.0))], loads, obstacles=obstacles)
+
+        def found(inputs):
+            return getattr(vsr.solve(scene, inputs, model=model), quantity)
+
+        return jax.vmap(found)(inputs)
+
+    return quantities
+
+
+def with_slopes(quantities):
+    """Quantities of arms and the derivatives of the sum of their squares."""
+
+    def both(*given):
+        found, pull = jax.vjp(quantities, *given)
+        return found, pull(2 * found)
+
+    return both
+
+
+def deviations_of_mapped(name):
+    """Largest deviations of arms that are solved on two devices from those of `jax.vmap`, relative
+    to the largest value: of the quantities, and of their derivatives by the length, which the
+    devices share, and the inputs, taken inside and outside `jax.shard_map`."""
+    # nothing varies over the second axis: JAX refuses the results where they are typed so
+    mesh = jax.make_mesh((2, 1), ("arms", "others"), axis_types=(AxisType.Auto,) * 2)
+    shared, split = PartitionSpec(), PartitionSpec("arms")
+    mapped = partial(jax.shard_map, mesh=mesh, in_specs=(shared, split))
+    quantities = quantities_of(name)
+    inside = mapped(with_slopes(quantities), out_specs=(split, (shared, split)))
+    outside = with_slopes(mapped(quantities, out_specs=split))
+
+    @jax.jit
+    def all_of(*given):
+        return inside(*given), outside(*given), with_slopes(quantities)(*given)
+
+    arms = 100 if name == "in contact" else 4  # so many wait in a queue
+    *found, expected = all_of(jnp.array(0.3), jnp.linspace(0.1, 1.0, arms)[:, None])
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(expected))
+    return [
+        float(np.max(np.abs(x - y)) / np.max(np.abs(y)))
+        for one in found
+        for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(expected), strict=True)
+    ]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[] if name == "loaded" else pytest.mark.slow) for name in BATCHES],
+)
+def test_arms_on_two_devices_are_those_of_vmap(name):
+    """In a process of its own: the number of devices is set before the first use of JAX."""
+    if name == "in contact" and jax.__version_info__ < (0, 10):
+        pytest.skip("lax.split has no transpose inside shard_map where a part is not used")
+    flags = " ".join([*FLAGS, "--xla_force_host_platform_device_count=2"])
+    environment = os.environ | {"XLA_FLAGS": flags, "JAX_ENABLE_X64": "1"}
+    code = f"import test_transforms as t; print(t.deviations_of_mapped({name!r}))"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=Path(__file__).parent,
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    deviations = json.loads(done.stdout.splitlines()[-1])
+    assert len(deviations) == 6
+    assert max(deviations) < 1e-12
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "bare",
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("loaded", "in contact", "prescribed")
+        ),
+    ],
+)
+def test_an_exported_batch_has_any_size(name):
+    both = with_slopes(partial(quantities_of(name), 0.3))
+    (size,) = export.symbolic_shape("size")
+    exported = export.export(jax.jit(both))(jax.ShapeDtypeStruct((size, 1), jnp.float64))
+    if find_spec("flatbuffers"):  # JAX needs it to write programs
+        exported = export.deserialize(exported.serialize())
+    inputs = jnp.array([[0.1], [0.2], [1.0]])
+    expected = jax.tree.leaves(jax.jit(both)(inputs))
+    for size in (1, 3):
+        found = jax.tree.leaves(exported.call(inputs[:size]))
+        for x, y in zip(found, expected, strict=True):
+            np.testing.assert_allclose(x, y[:size], rtol=1e-12, atol=1e-14)
 
 
 @pytest.mark.parametrize("half", ["float16", "bfloat16"])

@@ -71,6 +71,14 @@ def test_jax_has_it(module, name):
     assert hasattr(import_module(module), name) or import_module(f"{module}.{name}")
 
 
+def test_the_type_of_an_array_names_the_mesh_axes_over_which_it_varies():
+    """The words by which `numerics.loops` casts arrays inside `jax.shard_map`."""
+    of = jax.typeof(jnp.ones(2))
+    assert (of.vma if hasattr(of, "vma") else of.mat.varying) == frozenset()
+    assert not jax.sharding.get_abstract_mesh().manual_axes
+    assert hasattr(jax.lax, "pcast") or hasattr(jax.lax, "pvary")
+
+
 def test_settings_that_programs_depend_on_exist():
     from vsr_jax.numerics.compiling import _SETTINGS
 

@@ -37,6 +37,12 @@ DTypeLike = TypeAliasType("DTypeLike", jax.typing.DTypeLike)
 PathLike = TypeAliasType("PathLike", str | os.PathLike[str])
 """The path of a file or folder."""
 
+Size = Any
+"""Length of an axis: an integer, in `jax.export` also a symbol."""
+
+Shape = tuple[Size, ...]
+"""Lengths of axes."""
+
 Tree = TypeVar("Tree")
 
 

@@ -31,6 +31,7 @@ from ..models.base import Outcome, Status, SteppedModel, resolved
 from ..models.strain_dependent import StrainDependent
 from ..numerics.compiling import program
 from ..numerics.component import add, free_components, multiply, spread, subtract
+from ..numerics.loops import while_loop
 from ..numerics.quadrature import Grid
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve, status_of_inputs
@@ -223,7 +224,7 @@ def _follow(
     def proceed(walk: _Walk) -> Array:
         return (walk.found < points) & (walk.cuts < _MOST_CUTS) & ~walk.ended
 
-    walk = lax.while_loop(proceed, partial(_attempt, system, step), walk)
+    walk = while_loop(proceed, partial(_attempt, system, step), walk)
     place = jnp.minimum(jnp.arange(points), jnp.maximum(walk.found - 1, 0))
     lost = (walk.cuts == _MOST_CUTS) & (jnp.arange(points) >= walk.found)
     status = jnp.where(lost & start.converged, Status.BRANCH_LOST, start.status).astype(jnp.int32)
@@ -304,7 +305,7 @@ def _corrected(system: _System, goal: Array, row: Array) -> tuple[Array, Array, 
         return u - change, J, jnp.linalg.norm(change), count + 1
 
     J = jnp.zeros((goal.size - 1, goal.size), goal.dtype)
-    return lax.while_loop(
+    return while_loop(
         proceed, correct, (goal, J, jnp.array(jnp.inf, goal.dtype), jnp.zeros((), jnp.int32))
     )
 

@@ -19,13 +19,13 @@ considerations on transmission characteristics for tendon drive robots, ICAR 199
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array
 
 from ..arm.scene import Scene
 from ..models.base import Model, Near, Outcome, Status
 from ..models.strain_dependent import StrainDependent
 from ..numerics.compiling import program
+from ..numerics.loops import scan
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import checked_outcome, near_of
 from ..typing import ArrayLike, cast
@@ -117,4 +117,4 @@ def _follow(scene: Scene, before: Near, inputs: Array) -> Outcome:
         return jax.tree.map(lambda a, b: jnp.where(found, a, b), after, carry), outcome
 
     start = (before.forces, model.remembered(before).state)
-    return lax.scan(proceed, start, inputs)[1]
+    return scan(proceed, start, inputs)[1]

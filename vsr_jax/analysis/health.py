@@ -12,7 +12,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array
 
 from ..arm.scene import Scene
@@ -21,6 +20,7 @@ from ..mechanics.balance import thread_direction, thread_wrench
 from ..models.base import Model, Status
 from ..numerics.compiling import program
 from ..numerics.component import free_components, norm, scale, split, times
+from ..numerics.loops import scan
 from ..numerics.quadrature import make_grid
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
@@ -258,7 +258,7 @@ def _limit(status_at: Callable[[Scalar], Array], dtype: DTypeLike) -> Limit:
         return (factors[first], factors[first + 1]), status[first]
 
     bracket = jnp.array(LEAST_FACTOR, dtype), jnp.array(MOST_FACTOR, dtype)
-    (low, high), status = lax.scan(narrow, bracket, None, length=_PASSES)
+    (low, high), status = scan(narrow, bracket, None, length=_PASSES)
     return Limit(jnp.where(status[-1] == Status.CONVERGED, high, low), status[-1])
 
 

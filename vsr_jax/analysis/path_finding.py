@@ -28,6 +28,7 @@ from ..arm.scene import Scene
 from ..models.base import Model
 from ..numerics import bounded_least_squares
 from ..numerics.compiling import messages, program
+from ..numerics.loops import fori_loop
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
 from ..typing import ArrayLike, Scalar, VectorLike, cast
@@ -196,7 +197,7 @@ def _find_path(problem: _PathProblem) -> InputPath:
         return jnp.broadcast_to(found.share, starts.shape)
 
     # again from there, with all weights: only the first start of a search has them
-    share = lax.fori_loop(0, 2, nearest, _starts(problem, rest))[0]
+    share = fori_loop(0, 2, nearest, _starts(problem, rest))[0]
     there = problem.at(share)
     violated = violation(problem.margins(there))
     return InputPath(problem.inputs(share), there, violated, violated <= 0)

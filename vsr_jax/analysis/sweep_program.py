@@ -19,6 +19,7 @@ from jaxtyping import Array, PyTree
 
 from ..arm.scene import Scene
 from ..models.base import Model
+from ..numerics.loops import fori_loop
 from ..solution.equilibrium import Equilibrium
 from ..solution.quantities import QUANTITIES, Quantity
 from ..solution.solver import solve
@@ -209,7 +210,7 @@ def _solved(task: Task, samples: PyTree, batches: Array, mesh: Mesh) -> dict[str
 
         shapes = jax.eval_shape(solve, jax.tree.map(lambda x: x[0], samples))
         none = jax.tree.map(lambda x: jnp.zeros((number(samples), *x.shape), x.dtype), shapes)
-        return lax.fori_loop(0, batches, with_batch, none)
+        return fori_loop(0, batches, with_batch, none)
 
     specs = PartitionSpec(), _SPLIT, PartitionSpec()
     outputs = jax.shard_map(part, mesh=mesh, in_specs=specs, out_specs=_SPLIT, check_vma=False)(

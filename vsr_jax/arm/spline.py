@@ -2,9 +2,9 @@
 
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float
 
+from ..numerics.loops import scan
 from ..typing import Scalar, ScalarLike, VectorLike
 from ..validation import concrete, numbers
 
@@ -83,5 +83,5 @@ def _tridiagonal(lower: Array, diagonal: Array, upper: Array, right: Array) -> A
         return here, here
 
     zero = jnp.zeros((), right.dtype)
-    _, rows = lax.scan(down, (zero, zero), (lower, diagonal, upper, right))
-    return lax.scan(up, zero, rows, reverse=True)[1]
+    _, rows = scan(down, (zero, zero), (lower, diagonal, upper, right))
+    return scan(up, zero, rows, reverse=True)[1]

@@ -10,6 +10,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ..numerics.component import norm, split
+from ..numerics.loops import fori_loop, scan
 from ..numerics.quadrature import ascending
 from ..typing import MatrixLike, Pose, Scalar, ScalarLike, VectorLike, real
 from ..validation import concrete, numbers, rigid
@@ -126,7 +127,7 @@ class Tube(Obstacle):
             s = s + h * rate(s + 0.5 * h * rate(s))
             return s, turn @ curve.at(s)[1] * rate(s)
 
-        return lax.scan(walk, start, lengths)[1]
+        return scan(walk, start, lengths)[1]
 
 
 class Curve(NamedTuple):
@@ -217,7 +218,7 @@ def _nearest(curve: Curve, point: Position) -> tuple[Scalar, Bool[Array, ""]]:
 
     # two neighbours away: the nearest one may be the same place
     start = ends[jnp.maximum(best - 1, 0)], tried[best], ends[jnp.minimum(best + 3, ends.size - 1)]
-    found = lax.fori_loop(0, _STEPS, improve, start)[1]
+    found = fori_loop(0, _STEPS, improve, start)[1]
     s = jnp.where(curve.depth(point, found) > curve.depth(point, start[1]), found, start[1])
     rate, slope = _stationarity(curve, point, s)
     depth = curve.depth(point, s)

@@ -28,6 +28,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from ..numerics.loops import fori_loop, scan
 from ..numerics.once import once
 from ..numerics.quadrature import Grid
 from ..numerics.stacked import affine, columns, matmul, product, rows, transpose
@@ -67,8 +68,8 @@ def multiplied_by_hinges(hinges: Hinge, strain: Array, grid: Grid) -> Array:
             wrench, start = wrench - part * inside, start + inside
         return start, wrench
 
-    _, motions = lax.scan(forward, none, places)
-    _, wrench = lax.scan(backward, none, (motions, places), reverse=True)
+    _, motions = scan(forward, none, places)
+    _, wrench = scan(backward, none, (motions, places), reverse=True)
     return by_place(jnp.moveaxis(wrench, 0, 2), grid, arms)
 
 
@@ -95,7 +96,7 @@ def solved_by_hinges(
         start, (X, negative, compliance, Q) = before(free, end, at_node(hinges, place, len(arms)))
         return start, (X, negative, asymmetry_of(Q, None, compliance))
 
-    _, (X, negative, asymmetry) = lax.scan(backward, (none, none), places, reverse=True)
+    _, (X, negative, asymmetry) = scan(backward, (none, none), places, reverse=True)
 
     def forward(z: Array, hinge: tuple) -> tuple[Array, Array]:
         X = once(hinge[0])
@@ -103,7 +104,7 @@ def solved_by_hinges(
         return behind(z, link, w, columns(X, 0, 6), columns(X, 6, width))
 
     start = jnp.zeros((6, width - 6, *arms), X.dtype)
-    _, strain = lax.scan(forward, start, (X, places))
+    _, strain = scan(forward, start, (X, places))
     return by_place(jnp.moveaxis(strain, 0, 2), grid, len(arms)), negative, asymmetry
 
 
@@ -141,7 +142,7 @@ def _condensed(hinges: Hinge, grid: Grid, free: tuple[int, ...]) -> tuple[Array,
         return start, (X, negative, compliance)
 
     order = jnp.arange(stages)
-    pushed, found = lax.scan(backward, halves(wrench), order, reverse=True)
+    pushed, found = scan(backward, halves(wrench), order, reverse=True)
     X, negative, compliance = found
 
     def forward(z: Array, hinge: tuple) -> tuple[Array, Array]:
@@ -150,7 +151,7 @@ def _condensed(hinges: Hinge, grid: Grid, free: tuple[int, ...]) -> tuple[Array,
         others = jnp.pad(columns(X, 6, width), [(0, 0), (6, 0), (0, 0)])
         return behind(z, link, w, columns(X, 0, 6), others)
 
-    moved, strain = lax.scan(forward, motion, (X, order))
+    moved, strain = scan(forward, motion, (X, order))
     moved = jnp.concatenate([moved, strain.reshape(-1, width, steps)])
     negative = jnp.sum(negative, axis=0, dtype=jnp.int32)
     return moved, jnp.concatenate(pushed), negative, compliance[0]
@@ -187,14 +188,14 @@ def _joined(
 
     none = jnp.zeros(moved.shape[:2], moved.dtype)
     steps = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), given)
-    _, (y, W, negative, Q) = lax.scan(backward, none, steps, reverse=True)
+    _, (y, W, negative, Q) = scan(backward, none, steps, reverse=True)
     y, W, Q = (jnp.moveaxis(x, 0, -1) for x in (y, W, Q))
     ends = once(moved + product(L, y))
 
     def forward(z: Array, end: Array) -> tuple[Array, Array]:
         return affine(end, z), z
 
-    _, z = lax.scan(forward, columns(none, 6, width), jnp.moveaxis(ends, -1, 0))
+    _, z = scan(forward, columns(none, 6, width), jnp.moveaxis(ends, -1, 0))
     z = jnp.moveaxis(z, 0, -1)
     return z, affine(y, z), affine(W, z), negative, Q
 
@@ -225,5 +226,5 @@ def _factors(F: Array) -> tuple[Array, Array, Array, Array]:
         return less, L.at[:, i].set(column), U.at[i].set(row), signs.at[i].set(sign)
 
     state = F, jnp.zeros_like(F), jnp.zeros_like(F[:6]), jnp.ones_like(F[:6, 0])
-    left, L, U, signs = lax.fori_loop(0, 6, eliminate, state)
+    left, L, U, signs = fori_loop(0, 6, eliminate, state)
     return L, U, signs, left

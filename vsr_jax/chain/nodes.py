@@ -8,14 +8,15 @@ from jaxtyping import Array
 from ..numerics.component import Matrix, Tree
 from ..numerics.once import once
 from ..numerics.quadrature import Grid
+from ..typing import Shape
 
 
-def whole(x: Array, shape: tuple[int, ...]) -> Array:
+def whole(x: Array, shape: Shape) -> Array:
     """An array whose last axes are those of all nodes, (stages, steps, *arms)."""
     return jnp.broadcast_to(x, (*x.shape[: x.ndim - len(shape)], *shape))
 
 
-def block_of(H: Matrix, first: int, second: int, shape: tuple[int, ...]) -> Array:
+def block_of(H: Matrix, first: int, second: int, shape: Shape) -> Array:
     """Block (3, 3, stages, steps, *arms) of a matrix of all nodes, from two indices on."""
     entries = [whole(H[first + i][second + j], shape) for i in range(3) for j in range(3)]
     return jnp.stack(entries).reshape(3, 3, *shape)

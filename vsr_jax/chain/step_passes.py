@@ -30,11 +30,11 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array
 
 from ..numerics import component as c
 from ..numerics.component import Matrix, Tree
+from ..numerics.loops import scan
 from ..numerics.once import once
 from ..numerics.quadrature import Grid, collocation, gauss_legendre, remaining, weighted
 from ..numerics.stacked import cross, matvec, rows
@@ -96,8 +96,8 @@ def changes_by_steps(nodes: StepNodes, strain: Array, grid: Grid) -> Array:
         return jnp.concatenate([moments[:, -1], forces[:, -1]]), jnp.concatenate(wrench)
 
     none = jnp.zeros_like(strain[:, 0, 0])
-    _, turns = lax.scan(forward, none[:3], places)
-    _, found = lax.scan(backward, none, (turns, places), reverse=True)
+    _, turns = scan(forward, none[:3], places)
+    _, found = scan(backward, none, (turns, places), reverse=True)
     found = jnp.moveaxis(found, 0, -1 - arms)
     return by_place(found[:, 0], grid, arms) if arms else found
 
@@ -126,7 +126,7 @@ def _step_by_step(
         return start, (maps, jnp.concatenate([joint.turned, joint.pulled]), negative)
 
     steps = _moved((maps, given, link.jump, link.joined), -1, 0)
-    _, (maps, given, negative) = lax.scan(backward, end, steps, reverse=True)
+    _, (maps, given, negative) = scan(backward, end, steps, reverse=True)
     maps, given = _moved((maps, given), 0, -1)
     (turn, wrench), (turned_end, pulled) = parted(maps), parted(given)
     joint = Joint(turn, turned_end, wrench, pulled)
@@ -151,7 +151,7 @@ def _node_by_node(
         signs = negative + local, stable, step.asymmetry(start[0])
         return start, (strain, joint.turn, joint.turned, signs)
 
-    _, (strain, turn, turned_end, signs) = lax.scan(backward, end, places, reverse=True)
+    _, (strain, turn, turned_end, signs) = scan(backward, end, places, reverse=True)
     joined = None if nodes.joined is None else nodes.joined[places]
     theta = _rotations(turn, turned_end, joined)
     return _moved(strain, 0, last), theta, signs
@@ -165,7 +165,7 @@ def _rotations(turn: Array, more: Array, joined: Array | None) -> Array:
         turn, more, joined = jax.tree.map(once, step)
         return c.times(joined, matvec(turn, theta) + more), theta
 
-    return lax.scan(forward, none, (turn, more, joined))[1]
+    return scan(forward, none, (turn, more, joined))[1]
 
 
 def step_nodes(

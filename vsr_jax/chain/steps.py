@@ -9,6 +9,7 @@ from jax import lax
 from jaxtyping import Array
 
 from ..numerics import component as c, stacked
+from ..numerics.loops import fori_loop
 from ..numerics.once import once
 from ..numerics.quadrature import collocation, gauss_legendre, remaining, weighted
 from ..numerics.stacked import (
@@ -218,7 +219,7 @@ def _compliance(C: Array, by_bend: Array) -> tuple[Array, Array]:
         return once(jnp.where(here[:, None], row[:, :, None], others)), negative + below
 
     negative = jnp.zeros(C.shape[3:], jnp.int32)
-    inverse, negative = lax.fori_loop(0, stages, eliminate, (system, negative))
+    inverse, negative = fori_loop(0, stages, eliminate, (system, negative))
     return matmul(inverse, C[:, :, None]), negative
 
 

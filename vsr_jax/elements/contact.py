@@ -35,7 +35,6 @@ from dataclasses import replace
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, PyTree
 
 from ..arm.obstacles import Obstacle
@@ -46,6 +45,7 @@ from ..mechanics.coupling import SOFTENED, ArmProblem, ArmState, Constraint, Cou
 from ..mechanics.sizes import softest
 from ..numerics.component import Forces, Vector
 from ..numerics.damped_newton import HARDENING_STAGES, SOFT_STAGES
+from ..numerics.loops import scan
 from ..numerics.quadrature import Grid, locate
 from ..numerics.se3 import base_pose, stacked_rotation
 from ..typing import DTypeLike
@@ -359,7 +359,7 @@ def _bending_along(obstacle: Obstacle, base: Array | None, h: Array) -> Array | 
         k = R.T @ vector / jnp.where(h > 0, h, jnp.inf)
         return stacked_rotation(vector) @ R, k[1:]
 
-    return lax.scan(turn, pose[:3, :3], (ahead, h))[1].T
+    return scan(turn, pose[:3, :3], (ahead, h))[1].T
 
 
 def contacts_of(scene: Scene, sections: CrossSections, grid: Grid) -> Contacts | None:

@@ -19,6 +19,7 @@ from jaxtyping import Array
 from ..arm.obstacles import Obstacle
 from ..arm.rod import Rod
 from ..numerics.batching import arms_in
+from ..numerics.loops import alike, while_loop
 from ..numerics.once import once
 from ..numerics.quadrature import Grid, interpolation, weighted
 from ..numerics.stacked import cross, matvec
@@ -156,7 +157,8 @@ class _Curves(NamedTuple):
 
         def bent(axis: Array) -> tuple[Array, Array, Array]:
             along = jnp.broadcast_to(axis.reshape(3, *(1,) * (place.ndim - 1)), place.shape)
-            normal, change, distance = jax.jvp(slopes, (place,), (along,), has_aux=True)
+            at, along = alike(place, along)
+            normal, change, distance = jax.jvp(slopes, (at,), (along,), has_aux=True)
             return distance, normal, change
 
         return jax.vmap(bent, out_axes=(None, None, 1))(jnp.eye(3, dtype=place.dtype))
@@ -248,6 +250,7 @@ def _along(obstacle: Obstacle, place: Array, first: Array, second: Array) -> tup
     def slope(place: Array, first: Array) -> Array:
         return jax.jvp(obstacle.distance, (place,), (first,))[1]
 
+    place, first, second = alike(place, first, second)
     return jax.jvp(slope, (place, first), (first, second))
 
 
@@ -257,6 +260,7 @@ def _outline_along(rod: Rod, X: Array, h: Array) -> tuple[Array, Array]:
     def slope(X: Array) -> Array:
         return jax.jvp(rod.outline, (X,), (h,))[1]
 
+    X, h = alike(X, h)
     return jax.jvp(slope, (X,), (h,))
 
 
@@ -280,7 +284,7 @@ def _search(curves: _Curves, first: Array) -> Array:
     def going(state: tuple) -> Array:
         return jnp.any(state[1] > tolerance) & (state[2] < _ITERATIONS)
 
-    return lax.while_loop(going, closer, (first, jnp.ones_like(first), jnp.array(0)))[0]
+    return while_loop(going, closer, (first, jnp.ones_like(first), jnp.array(0)))[0]
 
 
 def _polynomial(starts: Array, axis: Array, h: Array) -> Array:

@@ -9,6 +9,7 @@ from ..arm.actuator import Actuator
 from ..arm.routing import thread_tangent
 from ..arm.scene import Scene
 from ..numerics.compiling import program
+from ..numerics.loops import fori_loop
 from ..typing import Scalar
 from .stations import Stations, in_blocks, polygon_size
 
@@ -76,7 +77,7 @@ def _ring(
     def improved(_: Array | int, delta: Array) -> Array:
         return radius / t[0] * jnp.sum(direction * along(delta)[1][:, 1:], axis=-1)
 
-    delta = jax.lax.fori_loop(0, _ITERATIONS, improved, jnp.zeros_like(angles))
+    delta = fori_loop(0, _ITERATIONS, improved, jnp.zeros_like(angles))
     off = jnp.max(jnp.abs(improved(0, delta) - delta)) * t[0]
     place, unit = along(delta)
     share = jnp.sum(direction * unit[:, 1:], axis=-1, keepdims=True) / (1 + unit[:, :1])

@@ -8,7 +8,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, PyTree
 
 from ..numerics import component as c
@@ -18,6 +17,7 @@ from ..numerics.batching import (
     arms_in,
     at_once,
     iterated,
+    known,
     queued,
     side_by_side,
 )
@@ -35,10 +35,11 @@ from ..numerics.damped_newton import (
     damped_newton,
 )
 from ..numerics.implicit import implicit_root
+from ..numerics.loops import fori_loop
 from ..numerics.newton import Root
 from ..numerics.once import once
 from ..numerics.stacked import components, stack, total
-from ..typing import cast
+from ..typing import Shape, cast
 from .arm_balance import ArmImbalance, ArmUnknown, imbalance_of, rounding_of, state_of
 from .arm_tangent import approximate_solve, followed, tangent_solve
 from .balance import completed, residual, strain_norm, with_locked, without_force
@@ -136,7 +137,7 @@ def _start(problem: ArmProblem, free: tuple[int, ...]) -> ArmUnknown:
         return c.subtract(xi, step), jnp.where(i == 0, size, first), size
 
     none = jnp.zeros((), rest[0].dtype)
-    xi, first, last = lax.fori_loop(0, _START_STEPS, closer, (rest, none, none))
+    xi, first, last = fori_loop(0, _START_STEPS, closer, (rest, none, none))
     near = last <= 0.5 ** (_START_STEPS - 1) * first
     xi = tuple(
         jnp.where(near, x, x0).astype(exact.dtype)
@@ -169,7 +170,7 @@ class _Sizes(NamedTuple):
 
     problem: ArmProblem
     free: tuple[int, ...]
-    arms: tuple[int, ...]
+    arms: Shape
 
     def of_step(self, step: ArmUnknown, at: ArmState) -> Array:
         """Largest change of the shape, plus those of the couplings."""
@@ -259,7 +260,7 @@ def _solve(
     arms = arms_in((origin, guess, whole), whole.grid.h.ndim - 1)
     given = whole, origin, guess, jnp.broadcast_to(rounding_of(whole), arms)
     lanes = at_once(_LANES)
-    if _uneven(whole) and arms and arms[0] > lanes:
+    if _uneven(whole) and arms and known(arms[0]) and arms[0] > lanes:
         root = queued(partial(_iteration, free, (lanes,)), given, arms[0], lanes)
     else:
         root = iterated(_iteration(free, arms, given))
@@ -280,7 +281,7 @@ def _uneven(problem: ArmProblem) -> bool:
 
 def _iteration(
     free: tuple[int, ...],
-    arms: tuple[int, ...],
+    arms: Shape,
     given: tuple[ArmProblem, ArmUnknown, ArmUnknown | None, Array],
 ) -> Iteration:
     """Newton's method for a batch of arms: their problem, where it begins, a guess, and the

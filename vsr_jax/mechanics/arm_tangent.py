@@ -15,6 +15,7 @@ from ..chain import Border, Chain, Definiteness, bordered_solve, with_spans
 from ..chain.spans import Solve, solve_both
 from ..numerics import component as c
 from ..numerics.component import Vector, free_components, spread
+from ..numerics.loops import while_loop
 from ..numerics.once import once
 from ..numerics.quadrature import Grid
 from ..typing import cast
@@ -284,5 +285,5 @@ def _refined(apply: Callable, nearly: Callable, right: Array, kept: int) -> Arra
     nothing = jnp.where(size > 0, 0, 0)
     none, no = jnp.zeros((kept, *right.shape), right.dtype) + nothing, nothing > 0
     begin = _Refinement(none[0], right, none, none, nothing, ~(size > 0), no, no)
-    end = lax.while_loop(lambda at: ~at.done, advance, begin)
+    end = while_loop(lambda at: ~at.done, advance, begin)
     return jnp.where(end.found, largest * end.x, jnp.nan)  # no derivative rather than a wrong one

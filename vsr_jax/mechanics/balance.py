@@ -30,7 +30,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array
 
 from ..arm.routing import Path, thread_tangent
@@ -55,6 +54,7 @@ from ..numerics.component import (
     times,
 )
 from ..numerics.implicit import implicit_root
+from ..numerics.loops import scan
 from ..numerics.newton import Evaluation, Root, newton
 
 _LOOPED = 3
@@ -112,7 +112,7 @@ def over_threads(more: Callable, total: Tree, paths: tuple, forces: tuple) -> Tr
     shape = jnp.broadcast_shapes(*(x.shape for x in leaves))
     total, threads = jax.tree.map(lambda x: jnp.broadcast_to(x, shape), (total, threads))
     listed = jax.tree.map(lambda *same: jnp.stack(same), *threads)
-    return lax.scan(lambda total, thread: (more(total, *thread), None), total, listed)[0]
+    return scan(lambda total, thread: (more(total, *thread), None), total, listed)[0]
 
 
 def residual(

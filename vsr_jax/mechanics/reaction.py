@@ -17,12 +17,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array
 
 from ..chain import Coupled
 from ..numerics.component import Forces, Vector
 from ..numerics.implicit import change_of, unchanged
+from ..numerics.loops import scan
 from ..numerics.magnus import magnus_6
 from ..numerics.once import once
 from ..numerics.quadrature import (
@@ -126,7 +126,7 @@ def rotations(k: Array, h: Array, base: Array | None) -> tuple[Array, Array, Arr
         matrix.reshape(3, 3, *matrix.shape[2:], *(1,) * (whole.ndim - 1 - matrix.ndim)),
         whole.shape[1:],
     )
-    end, starts = lax.scan(lambda R, E: (matmul(R, once(E)), R), first, whole)
+    end, starts = scan(lambda R, E: (matmul(R, once(E)), R), first, whole)
     starts = jnp.moveaxis(starts, 0, 2)
     return starts, matmul(starts[:, :, None], within_step[:, :, :-1]), end
 

@@ -18,6 +18,7 @@ from ..arm.scene import CrossSections
 from ..numerics import component as c
 from ..numerics.component import Forces, Vector, free_block, free_components
 from ..numerics.implicit import change_of
+from ..numerics.loops import alike
 from ..numerics.once import once
 from ..numerics.quadrature import Grid, beyond, interpolation, locate, weighted, within
 from .balance import completed, over_threads, tangent, thread_wrench
@@ -168,6 +169,7 @@ def _alike(values: tuple, rates: tuple) -> tuple[Any, Any]:
     pairs = [
         jnp.broadcast_arrays(x, dx) for x, dx in zip(leaves, jax.tree.leaves(rates), strict=True)
     ]
+    pairs = [alike(*pair) for pair in pairs]
     return tuple(jax.tree.unflatten(tree, list(side)) for side in zip(*pairs, strict=True))
 
 

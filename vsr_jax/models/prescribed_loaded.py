@@ -33,6 +33,7 @@ from ..numerics.implicit import implicit_root
 from ..numerics.newton import Root
 from ..numerics.quadrature import Grid
 from ..numerics.stacked import components
+from ..typing import Shape
 
 _ASYMMETRIC = 0.2
 """Asymmetry of two coordinates of the tangent, as a fraction of their elastic stiffness, above
@@ -317,7 +318,7 @@ def _solve(basis: NodalBasis, problem: ArmProblem) -> Root:
     return iterated(damped_newton(evaluate, measures, first, floor, schedule))
 
 
-def _stirs(K: Array, arms: tuple[int, ...]) -> Array:
+def _stirs(K: Array, arms: Shape) -> Array:
     """A step of all coordinates, in no symmetric way."""
     some = jnp.cos(jnp.arange(len(K), dtype=K.dtype)).reshape(-1, *(1,) * len(arms))
     return some * jnp.sqrt(K[0, 0] / lu.diagonal(K))

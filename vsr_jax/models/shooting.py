@@ -21,7 +21,6 @@ from typing import Any, NamedTuple
 import diffrax
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array
 
 from ..arm.scene import CrossSections, Scene, shared
@@ -30,6 +29,7 @@ from ..mechanics.balance import solve_balance
 from ..mechanics.turning import balanced_strain_rate, reaction_rate
 from ..numerics import component as c
 from ..numerics.component import Forces, Vector
+from ..numerics.loops import scan, while_loop
 from ..numerics.quadrature import Grid
 from ..numerics.se3 import base_pose, hat, stacked_rotation, unskew
 from ..numerics.stacked import turned
@@ -248,10 +248,10 @@ def shoot(
     none, far = jnp.zeros((), jnp.int32), jnp.asarray(jnp.inf, zero.dtype)
     poses = jnp.zeros((number, 4, 4), zero.dtype)
     begin = _Iterate(zero, zero, far, far, none, jnp.array(False), none, poses)
-    found = lax.while_loop(proceed, step, begin)
+    found = while_loop(proceed, step, begin)
     unknown = match.unknown(found.z)
     base = jnp.eye(4, dtype=zero.dtype).at[:3, :3].set(unknown.rotation[0])
-    last, starts = lax.scan(lambda pose, increment: (pose @ increment, pose), base, found.poses)
+    last, starts = scan(lambda pose, increment: (pose @ increment, pose), base, found.poses)
     fits = found.done & (found.misfit <= tolerance)
     return Shot(segments, unknown, jnp.concatenate([starts, last[None]]), fits, found.steps)
 

@@ -11,8 +11,10 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array
 
+from ..typing import Shape, Size
 from .compiling import on_cpu
 from .component import select
+from .loops import alike, while_loop
 
 TOGETHER = 136
 """Arms that are solved together on a CPU, at most: the arrays of one pass then stay in the
@@ -45,9 +47,9 @@ def side_by_side(solve: Callable, together: int = TOGETHER) -> Callable:
         return solve(*arguments)
 
     @batched_solve.def_vmap
-    def _(size: int, batched: list, *arguments: Any) -> tuple[Any, Any]:
+    def _(size: Size, batched: list, *arguments: Any) -> tuple[Any, Any]:
         rows = _rows(size, together)
-        rows += 8 if rows % _ALIASED == 0 else 0
+        rows += 8 if known(size) and rows % _ALIASED == 0 else 0
 
         def solved(arguments: tuple) -> Any:
             every = jax.tree.map(
@@ -81,10 +83,10 @@ def in_parts(solve: Callable, together: int) -> Callable:
         return solve(*arguments)
 
     @batched_solve.def_vmap
-    def _(size: int, batched: list, *arguments: Any) -> tuple[Any, Any]:
+    def _(size: Size, batched: list, *arguments: Any) -> tuple[Any, Any]:
         axes = jax.tree.map(lambda own: 0 if own else None, tuple(batched))
         solved = jax.vmap(solve, axes)
-        if size <= at_once(together):
+        if not known(size) or size <= at_once(together):
             return (result := solved(*arguments)), jax.tree.map(lambda _: True, result)
         rows = _rows(size, together)
         return _by_parts(lambda part: solved(*part), arguments, batched, size, rows)
@@ -92,17 +94,27 @@ def in_parts(solve: Callable, together: int) -> Callable:
     return batched_solve
 
 
-def _rows(size: int, together: int) -> int:
+def known(size: Size) -> bool:
+    """Whether a size is a number. In `jax.export` it may be a symbol, which cannot be compared with
+    numbers: such a batch is solved together, whatever its size."""
+    return isinstance(size, int)
+
+
+def _rows(size: Size, together: int) -> Size:
     """Size of equal parts of a batch, none larger than `at_once`."""
+    if not known(size):
+        return size
     parts = -(-size // at_once(together)) or 1
     return -(-size // parts) or 1
 
 
 def _by_parts(
-    solved: Callable, arguments: tuple, batched: list, size: int, rows: int
+    solved: Callable, arguments: tuple, batched: list, size: Size, rows: Size
 ) -> tuple[Any, Any]:
     """Results of a batch whose axis comes first, from those of parts of a number of `rows`, the
     last one filled with copies of the last arguments, and that all of them are batched."""
+    if not known(size):
+        return (result := solved(arguments)), jax.tree.map(lambda _: True, result)
     parts = -(-size // rows) or 1
     place = jnp.minimum(jnp.arange(parts * rows), max(size - 1, 0))
     leaves, tree = jax.tree.flatten(arguments)
@@ -122,13 +134,13 @@ def _by_parts(
     return result, jax.tree.map(lambda _: True, result)
 
 
-def arms_in(tree: Any, axes: int) -> tuple[int, ...]:
+def arms_in(tree: Any, axes: int) -> Shape:
     """Shape of the batch of arms: what the last `axes` axes of all arrays broadcast to."""
     shapes = [np.shape(x) for x in jax.tree.leaves(tree)]
-    return np.broadcast_shapes(*(shape[len(shape) - axes :] for shape in shapes if shape))
+    return jnp.broadcast_shapes(*(shape[len(shape) - axes :] for shape in shapes if shape))
 
 
-def of_each_arm(function: Callable, arms: tuple[int, ...], *arguments: Any) -> Any:
+def of_each_arm(function: Callable, arms: Shape, *arguments: Any) -> Any:
     """A function of the numbers of one arm, for a batch of shape `arms` (one axis, or none) in the
     last axis of all arguments, of size 1 where they are the same for all arms."""
     if not arms:
@@ -161,7 +173,7 @@ class _Queue(NamedTuple):
 
 def iterated(iteration: Iteration) -> Any:
     """The results of all problems at the end."""
-    end = lax.while_loop(
+    end = while_loop(
         lambda state: jnp.any(iteration.busy(state)), iteration.advance, iteration.begin(None)
     )
     return iteration.result(end)
@@ -182,7 +194,7 @@ def queued(iteration: Callable[[Any], Iteration], data: Any, problems: int, lane
         current = iteration(queue.data)
         state = current.advance(queue.state)
         done = (queue.place < problems) & ~current.busy(state)
-        queue = queue._replace(state=state)
+        queue, _ = alike(queue._replace(state=state), data)  # both branches return one type
         return lax.cond(jnp.any(done), refilled, lambda queue, _: queue, queue, done)
 
     def refilled(queue: _Queue, done: Array) -> _Queue:
@@ -196,7 +208,8 @@ def queued(iteration: Callable[[Any], Iteration], data: Any, problems: int, lane
         given = chosen(jnp.minimum(place, problems - 1))
         begins = done & (place < problems)
         state = select(begins, iteration(given).begin(queue.state), queue.state)
-        return _Queue(state, place, given, queue.waiting + jnp.sum(done), results)
+        found = _Queue(state, place, given, queue.waiting + jnp.sum(done), results)
+        return alike(found, queue)[0]
 
     given = chosen(jnp.arange(lanes))
     first = iteration(given)
@@ -204,4 +217,4 @@ def queued(iteration: Callable[[Any], Iteration], data: Any, problems: int, lane
     shapes = jax.eval_shape(first.result, state)
     results = jax.tree.map(lambda x: jnp.zeros((*x.shape[:-1], problems), x.dtype), shapes)
     begin = _Queue(state, jnp.arange(lanes), given, jnp.array(lanes), results)
-    return lax.while_loop(lambda queue: jnp.any(queue.place < problems), advance, begin).results
+    return while_loop(lambda queue: jnp.any(queue.place < problems), advance, begin).results

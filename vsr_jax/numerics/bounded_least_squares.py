@@ -21,11 +21,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ..typing import Scalar
 from .component import select
+from .loops import fori_loop, while_loop
 
 _POWERS = (1 / 8, 3 / 16, 5 / 16)
 """The weights as powers of the machine epsilon; the square of the last is still resolved in the
@@ -122,7 +122,7 @@ def nearest(
     def pending(state: _Search) -> Array:
         return (state.start <= len(starts)) & (state.miss > allowed)
 
-    return lax.while_loop(pending, advance, _begun(f, starts, allowed)).best
+    return while_loop(pending, advance, _begun(f, starts, allowed)).best
 
 
 def _begun(f: Callable[[Array], Array], starts: Array, allowed: Scalar) -> _Search:
@@ -215,7 +215,7 @@ def _step(
         hit = room <= far
         return jnp.where(hit, end, s + far * way), free & ~hit
 
-    s, _ = lax.fori_loop(0, rest.size, along, (point.s, _free(point.s, slope)))
+    s, _ = fori_loop(0, rest.size, along, (point.s, _free(point.s, slope)))
     step = s - point.s
     return step, -(jnp.dot(slope, step) + jnp.dot(step, H @ step) / 2)
 

@@ -11,6 +11,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
 
+from .loops import alike
 from .newton import Root
 from .once import once
 
@@ -67,7 +68,7 @@ def implicit_root(
         change = jax.tree.map(jnp.negative, solve(x, *safe(primals), right))
         return found, Root(change, *no_derivative(*found[1:]))
 
-    return root(*parameters)
+    return root(*alike(*parameters))
 
 
 def unchanged(tangent: Any) -> bool:
@@ -127,4 +128,8 @@ def at_nodes(function: Callable) -> Callable:
 
 def no_derivative(*values: Array | None) -> tuple[Any, ...]:
     """Tangents of integer and boolean outputs."""
-    return jax.tree.map(lambda value: np.zeros(value.shape, jax.dtypes.float0), values)
+
+    def none(value: Array) -> Any:
+        return alike(np.zeros(value.shape, jax.dtypes.float0), value)[0]
+
+    return jax.tree.map(none, values)

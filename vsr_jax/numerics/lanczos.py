@@ -23,6 +23,7 @@ from jax.scipy.sparse.linalg import cg
 from jaxtyping import Array, Float
 
 from .implicit import change_of
+from .loops import fori_loop, scan, while_loop
 
 _MOST = 256
 """Bound on the number of products, or a quarter of the unknowns if that is more. Arms take 20 to
@@ -102,10 +103,10 @@ def extreme_pairs(operator: Operator) -> Pairs:
 
     def extend(basis: _KrylovBasis) -> _KrylovBasis:
         return _with_ritz(
-            lax.fori_loop(0, _BETWEEN, lambda _, basis: _one_more(operator, product, basis), basis)
+            fori_loop(0, _BETWEEN, lambda _, basis: _one_more(operator, product, basis), basis)
         )
 
-    basis = lax.while_loop(proceed, extend, _empty(start))
+    basis = while_loop(proceed, extend, _empty(start))
     found = ~unsettled(basis, eps**0.5, eps**0.4)
     vectors = (basis.s @ basis.rows).reshape(2, *start.shape)
     places = (2,) + (1,) * start.ndim
@@ -172,7 +173,7 @@ def _pivots(alpha: Array, link: Array, x: Array) -> Array:
         d = _pivot(entry[0] - x, entry[1], d)
         return d, d
 
-    return lax.scan(row, jnp.ones_like(x), (alpha, _shifted(link)))[1]
+    return scan(row, jnp.ones_like(x), (alpha, _shifted(link)))[1]
 
 
 def _pivot(diagonal: Array, link: Array, last: Array) -> Array:
@@ -203,16 +204,14 @@ def _ends(alpha: Array, link: Array, count: Array) -> Array:
             d = _pivot(alpha[j] - x, before[j], carry[0])
             return d, carry[1] + (d < 0)
 
-        _, negative = lax.fori_loop(
-            0, count, row, (jnp.ones_like(x), jnp.zeros(x.shape, jnp.int32))
-        )
+        _, negative = fori_loop(0, count, row, (jnp.ones_like(x), jnp.zeros(x.shape, jnp.int32)))
         above = negative >= wanted
         return jnp.max(jnp.where(above, low[:, None], x), axis=1), jnp.min(
             jnp.where(above, x, high[:, None]), axis=1
         )
 
     rounds = -(-jnp.finfo(alpha.dtype).nmant // 8) + 1
-    low, high = lax.fori_loop(0, rounds, cut, (jnp.stack([low, low]), jnp.stack([high, high])))
+    low, high = fori_loop(0, rounds, cut, (jnp.stack([low, low]), jnp.stack([high, high])))
     return 0.5 * (low + high)
 
 

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from .loops import fori_loop
+
 
 def factor(matrix: Float[Array, "n n *#arms"]) -> Float[Array, "n n *#arms"]:
     """Both factors in one matrix: U on and above the diagonal, L without its unit diagonal below
@@ -22,7 +24,7 @@ def factor(matrix: Float[Array, "n n *#arms"]) -> Float[Array, "n n *#arms"]:
         A = A - ratio[:, None] * jnp.where(below, row, 0.0)
         return A.at[:, k].set(jnp.where(below, ratio, A[:, k]))
 
-    return lax.fori_loop(0, matrix.shape[0], eliminate, matrix)
+    return fori_loop(0, matrix.shape[0], eliminate, matrix)
 
 
 def diagonal(factors: Float[Array, "n n *#arms"]) -> Float[Array, "n *#arms"]:
@@ -47,7 +49,7 @@ def substitute(
         x = b[k] / factors[k, k]
         return jnp.where(place < k, b - factors[:, k] * x, b).at[k].set(x)
 
-    return lax.fori_loop(0, size, backward, lax.fori_loop(0, size, forward, right))
+    return fori_loop(0, size, backward, fori_loop(0, size, forward, right))
 
 
 def solve(
@@ -95,5 +97,5 @@ def solve_with_pivots(
 
     none = jnp.zeros_like(right, bool)
     start = matrix, right, ~none, none
-    _, x, left, negative = lax.fori_loop(0, len(right), eliminate, start)
+    _, x, left, negative = fori_loop(0, len(right), eliminate, start)
     return jnp.where(left, 0.0, x), negative

@@ -9,12 +9,12 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float
 
 from ..typing import MatrixLike, Pose, Scalar, ScalarLike, Twist, VectorLike, real
 from ..validation import choice
 from .component import Vector
+from .loops import alike, scan
 from .once import once
 from .se3 import (
     adjoint,
@@ -111,7 +111,7 @@ def _advanced(
         g = stacked_product(g, once(increment))
         return g, g
 
-    end, ends = lax.scan(advance, start, increments)
+    end, ends = scan(advance, start, increments)
     return start, end, ends
 
 
@@ -149,6 +149,8 @@ def step_jacobian(
     2, 4 or 6 of $\mathrm{Ad}_{g}^{-1} \int \mathrm{Ad}_g B_q \, ds$ over it (eq. 15).
     """
 
+    strains, rates = alike(strains, rates)
+
     def column(rate: Float[Array, "stages 6"]) -> Twist:
         g, rate_of_g = jax.jvp(lambda xi: exp(step_twist(xi, h)), (strains,), (rate,))
         return vee(inverse(g) @ rate_of_g)
@@ -170,5 +172,5 @@ def accumulate_jacobian(
         return adjoint(inverse(increment)) @ J + step_jacobian(xi, rate, width), None
 
     start = jnp.zeros((6, rates.shape[-1]), rates.dtype)
-    J, _ = lax.scan(advance, start, (strains, rates, h))
+    J, _ = scan(advance, start, (strains, rates, h))
     return J

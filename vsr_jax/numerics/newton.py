@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array
 
 from .component import select
+from .loops import while_loop
 
 MAX_STEPS = 50
 """Bound on the evaluations of `newton`; the cases of the paper take 1 to 5."""
@@ -87,7 +87,7 @@ def newton(evaluate: Callable[[Any], Evaluation], start: Any, floor: Array) -> I
     still = jax.tree.map(jnp.zeros_like, start)
     first = Evaluation(still, jnp.zeros_like(merit), merit, jnp.ones(merit.shape, bool))
     begin = (start, first, jnp.ones_like(merit), jnp.zeros_like(merit), jnp.zeros((), jnp.int32))
-    x, at, fraction, _, count = lax.while_loop(proceed, advance, begin)
+    x, at, fraction, _, count = while_loop(proceed, advance, begin)
     # a step of which even a fraction was rejected is not taken
     last = select(fraction == 1, at.step, jax.tree.map(jnp.zeros_like, at.step))
     return Iterate(jax.tree.map(jnp.subtract, x, last), at.definite, count)

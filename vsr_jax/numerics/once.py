@@ -44,13 +44,13 @@ def _clamped(x: Array) -> Array:
 def _gathered(x: Array) -> Array:
     """The values, gathered row by row along all axes but the last."""
     rows = x.reshape(-1, *x.shape[-1:])
-    return rows.at[jnp.arange(len(rows))].get(mode="promise_in_bounds").reshape(x.shape)
+    return rows.at[jnp.arange(rows.shape[0])].get(mode="promise_in_bounds").reshape(x.shape)
 
 
 def _kept(x: Array, *, summed: bool) -> Array:
     """The cheapest: a division in double precision takes longer than a gather. Of one row, XLA sees
     that a gather changes nothing."""
-    several = math.prod(x.shape[:-1]) > 1
+    several = math.prod(x.shape[:-1]) not in (0, 1)  # where it is a symbol too
     if x.dtype != jnp.float64 and not (summed and several):
         return _divided(x)
     return _gathered(x) if several else _clamped(x)

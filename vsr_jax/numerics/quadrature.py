@@ -13,6 +13,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..typing import Scalar
+from .loops import scan
 from .small_product import parts
 
 
@@ -168,7 +169,7 @@ def beyond(density: Array, grid: Grid) -> Array:
     sums = weighted(remaining(grid.X.shape[0]), grid.h * density, axis=1)
     whole = jnp.moveaxis(sums[:, -1], 1, 0)
     none = jnp.zeros_like(whole[0])
-    _, later = lax.scan(lambda total, part: (total + part, total), none, whole, reverse=True)
+    _, later = scan(lambda total, part: (total + part, total), none, whole, reverse=True)
     return sums[:, :-1] + jnp.moveaxis(later, 0, 1)[:, None]
 
 

@@ -11,12 +11,14 @@ from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
+
+from ..typing import Shape
+from .loops import alike, manual
 
 _FEW = 16
 """Number of terms up to which `total` adds them one by one."""
@@ -47,9 +49,17 @@ def cross(a: Array, b: Array) -> Array:
 
 
 def _alike(a: Array, b: Array) -> tuple[Array, Array]:
-    """Both factors in the higher one of their precisions."""
+    """Both factors in the higher one of their precisions, and of one type inside a mesh."""
     dtype = jnp.promote_types(a.dtype, b.dtype)
-    return a.astype(dtype), b.astype(dtype)
+    a, b = alike(a.astype(dtype), b.astype(dtype))
+    return a, b
+
+
+def _of_shape(shape: Shape, factor: ShapedArray) -> ShapedArray:
+    """Type of a product of this shape, which inside a mesh varies as its factors do."""
+    if manual():
+        return factor.update(shape=shape, weak_type=False)
+    return ShapedArray(shape, factor.dtype)
 
 
 def _contracted(a: Any, b: Any, *, lead: int, of: tuple[int, int]) -> Array:
@@ -64,11 +74,11 @@ def _shape(a: ShapedArray, b: ShapedArray, *, lead: int, of: tuple[int, int]) ->
     one, other = a.shape[lead : lead + 2], b.shape[lead : lead + 2]
     if len(a.shape) != len(b.shape) or one[of[0]] != other[of[1]]:
         raise TypeError(f"no product of matrices of shapes {a.shape} and {b.shape}")
-    axes = np.broadcast_shapes(
+    axes = jnp.broadcast_shapes(
         a.shape[:lead] + a.shape[lead + 2 :], b.shape[:lead] + b.shape[lead + 2 :]
     )
     matrix = one[1 - of[0]], other[1 - of[1]]
-    return ShapedArray((*axes[:lead], *matrix, *axes[lead:]), a.dtype)
+    return _of_shape((*axes[:lead], *matrix, *axes[lead:]), a)
 
 
 def _by_first(back: Any, a: Any, b: Any, *, lead: int, of: tuple[int, int]) -> Array:
@@ -97,7 +107,7 @@ def _crossed(a: Any, b: Any, *, lead: int) -> Array:
 def _cross_shape(a: ShapedArray, b: ShapedArray, *, lead: int) -> ShapedArray:
     if len(a.shape) != len(b.shape) or not a.shape[lead] == b.shape[lead] == 3:
         raise TypeError(f"no product of vectors of shapes {a.shape} and {b.shape}")
-    return ShapedArray(np.broadcast_shapes(a.shape, b.shape), a.dtype)
+    return _of_shape(jnp.broadcast_shapes(a.shape, b.shape), a)
 
 
 def _cross_by_first(back: Any, a: Any, b: Any, *, lead: int) -> Array:
@@ -108,7 +118,7 @@ def _cross_by_second(back: Any, a: Any, b: Any, *, lead: int) -> Array:
     return _summed_to(b.aval.shape, _cross.bind(back, a, lead=lead))
 
 
-def _summed_to(shape: tuple[int, ...], x: Array) -> Array:
+def _summed_to(shape: Shape, x: Array) -> Array:
     """Sum over the axes along which a factor of a shape was repeated."""
     axes = tuple(i for i, (one, all) in enumerate(zip(shape, x.shape, strict=True)) if one != all)
     return jnp.sum(x, axes, keepdims=True) if axes else x

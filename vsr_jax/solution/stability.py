@@ -30,6 +30,7 @@ from ..numerics import component as c, lu, stacked
 from ..numerics.component import Vector, free_block, free_components, spread
 from ..numerics.implicit import change_of
 from ..numerics.lanczos import Operator, extreme_pairs
+from ..numerics.loops import alike
 from ..numerics.quadrature import Grid
 
 _HOLDING = 0.5
@@ -41,7 +42,8 @@ def extreme_supported(
     problem: ArmProblem, unknown: ArmUnknown, free: tuple[int, ...], *, greatest: bool = False
 ) -> Array:
     """As `extreme`, of an arm with held sections or contacts."""
-    return _extreme(_supported(problem, unknown, free), -1 if greatest else 0)
+    (arm,) = alike(_supported(problem, unknown, free))
+    return _extreme(arm, -1 if greatest else 0)
 
 
 def extreme(
@@ -55,7 +57,8 @@ def extreme(
     Otherwise cables are ignored: a finite number of them cannot stiffen every section.
     """
     if scene.reacts or _yielding(scene):
-        return _extreme(arm_of(scene, inputs, forces, nodes), -1 if greatest else 0)
+        (arm,) = alike(arm_of(scene, inputs, forces, nodes))
+        return _extreme(arm, -1 if greatest else 0)
     lower = free_block(tangent(nodes.xi, nodes.sections, nodes.tau(forces)), scene.free)
     root = jnp.sqrt(c.join(free_components(nodes.sections.stiffness, scene.free)))
     values = jnp.linalg.eigvalsh(
