@@ -36,11 +36,11 @@ from vsr_jax.mechanics.resolution import COARSE
 
 try:
     from benchmarks import load_steps
-    from benchmarks.held_minimum import HeldArm
+    from benchmarks.energy_minimum import DiscArm, HeldArm
     from benchmarks.ordinary_scenes import STRUCTURES, Numbers, Structure, built
 except ModuleNotFoundError:  # as a script
     import load_steps
-    from held_minimum import HeldArm
+    from energy_minimum import DiscArm, HeldArm
     from ordinary_scenes import STRUCTURES, Numbers, Structure, built
 
 STEPS = 16
@@ -97,8 +97,8 @@ def drawn(structure: Structure, count: int, seed: int) -> list[Numbers]:
 
 def sought(structure: Structure, numbers: Numbers) -> tuple[str, dict[str, Any]]:
     """Verdict of the independent path on a draw that failed, and where the path ended."""
-    if structure.held:
-        return _sought_held(structure, numbers)
+    if structure.held or structure.discs:
+        return _sought_minimum(structure, numbers)
     arm = load_steps.Arm(structure, numbers)
     path = arm.follow()
     turn, tip = arm.turn(path.strain), arm.tip(path.strain)
@@ -126,8 +126,8 @@ def sought(structure: Structure, numbers: Numbers) -> tuple[str, dict[str, Any]]
 def confirmed(structure: Structure, numbers: Numbers, answer: Answer) -> tuple[str, dict[str, Any]]:
     """Verdict on a converged shape: whether the independent code stays there, if necessary on a
     finer mesh; and the bending of the arm."""
-    if structure.held:
-        return _confirmed_held(structure, numbers, answer)
+    if structure.held or structure.discs:
+        return _confirmed_minimum(structure, numbers, answer)
     L, record = numbers["length"], {}
     unit = numbers["young"] * np.pi * numbers["radius"] ** 4 / 4 / L**2
     for finer in (1, 4):
@@ -151,31 +151,33 @@ def confirmed(structure: Structure, numbers: Numbers, answer: Answer) -> tuple[s
     return "wrong: another shape", record
 
 
-def _sought_held(structure: Structure, numbers: Numbers) -> tuple[str, dict[str, Any]]:
-    """Verdict of the independent minima on a draw of a held arm that failed."""
-    arm = HeldArm(structure, numbers)
+def _sought_minimum(structure: Structure, numbers: Numbers) -> tuple[str, dict[str, Any]]:
+    """Verdict of the independent minima on a draw that failed."""
+    kind = HeldArm if structure.held else DiscArm
+    arm = kind(structure, numbers)
     found = arm.search()
     if found is None:
         return "no minimum found", {"turn": math.nan}
     record = {"turn": arm.turn(found.strain), "margin": found.margin}
     if record["turn"] > A_TURN:
         return "beyond a turn", record
-    fine = HeldArm(structure, numbers, 2 * arm.count)
+    fine = kind(structure, numbers, 2 * arm.count)
     there = fine.finished(np.repeat(found.strain, 2, axis=0), found.force)
     same = there is not None and there.margin > 0
     return ("false failure" if same else "in doubt"), record
 
 
-def _confirmed_held(
+def _confirmed_minimum(
     structure: Structure, numbers: Numbers, answer: Answer
 ) -> tuple[str, dict[str, Any]]:
-    """Verdict on a converged shape of a held arm."""
-    L, arm = numbers["length"], HeldArm(structure, numbers, load_steps.ELEMENTS)
+    """Verdict on a converged shape that minimizes an energy."""
+    kind, L = HeldArm if structure.held else DiscArm, numbers["length"]
+    arm = kind(structure, numbers, load_steps.ELEMENTS)
     unit = numbers["young"] * np.pi * numbers["radius"] ** 4 / 4 / L**2
     force = answer.support / unit / np.array([1, 1, 1, L, L, L])
     strain = answer.strain * np.array([L, L, L, 1, 1, 1])
     record = {"turn": arm.turn(strain)}
-    found = arm.finished(strain, force[: arm.rows])
+    found = arm.finished(strain, force[: 3 if structure.held == "pinned" else 6])
     if found is None or np.max(np.abs(arm.places(found.strain) - arm.places(strain))) > COARSE:
         return "wrong: another shape", record
     record["margin"] = found.margin

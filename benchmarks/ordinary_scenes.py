@@ -23,6 +23,7 @@ import vsr_jax as vsr
 
 Numbers = dict[str, Any]
 DENSITY = 1000.0
+DISCS = 5
 PARALLEL = 1e-9
 """Turns of a helix that stands for a parallel path."""
 MOST_WEIGHT, MOST_FORCE, MOST_MOMENT = 30.0, 10.0, 5.0
@@ -44,7 +45,8 @@ class Laid(NamedTuple):
 
 class Structure(NamedTuple):
     """Structure of a scene: tendons; gravity; wrenches by name, see `_loads`; the function that
-    draws its numbers; how its tip is held; and whether there are obstacles that it cannot reach."""
+    draws its numbers; how its tip is held; whether there are obstacles that it cannot reach; and
+    whether its tendons run straight between `DISCS` even discs."""
 
     tendons: tuple[Laid, ...] = ()
     gravity: bool = False
@@ -52,6 +54,7 @@ class Structure(NamedTuple):
     draw: Callable[["Structure", np.random.Generator], Numbers] | None = None
     held: Literal["pinned", "clamped"] | None = None
     beside: bool = False
+    discs: bool = False
 
     def numbers(self, random: np.random.Generator) -> Numbers:
         """One draw."""
@@ -65,7 +68,7 @@ def built(structure: Structure, numbers: Numbers, share: Any = 1.0) -> tuple[vsr
     material = vsr.Material(n["young"], poisson=n["poisson"], density=DENSITY)
     rest = (0.0, n["curvature"][0], n["curvature"][1], 1.0, 0.0, 0.0)
     rod = vsr.Rod(n["length"], section, material, rest_strain=rest, guide_radius=n["guide_radius"])
-    tendons = []
+    tendons, even = [], n["length"] * jnp.arange(1, DISCS + 1) / (DISCS + 1)
     for i, laid in enumerate(structure.tendons):
         path = vsr.Helix(n["place"][i], pitch=n["length"] / n["turns"][i], phase=n["phase"][i])
         if laid.control == "pressure":
@@ -79,6 +82,7 @@ def built(structure: Structure, numbers: Numbers, share: Any = 1.0) -> tuple[vsr
                 stiffness=n["stiffness"][i] if laid.elastic else None,
                 friction=n["friction"][i] if laid.motion else None,
                 motion=laid.motion or "pull",
+                disc_places=even if structure.discs else None,
             )
         )
     around: dict[str, Any] = {}
@@ -357,6 +361,7 @@ STRUCTURES = {
         (Laid("length", motion="pull"), Laid("length", motion="pull", winds=True), TENSION), True
     ),
     "antagonistic lengths": Structure((ELASTIC,) * 4, True, (), antagonistic),
+    "antagonistic lengths, discs": Structure((ELASTIC,) * 3, True, (), antagonistic, discs=True),
     "beside obstacles": Structure((TENSION,) * 2, True, ("tip world",), beside=True),
     "limp ropes beside obstacles": Structure((), True, ("tip world",), limp, beside=True),
     "held, taut, pinned": Structure((), True, SPREAD, taut, "pinned"),
