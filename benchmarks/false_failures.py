@@ -172,7 +172,7 @@ def _confirmed_minimum(
 ) -> tuple[str, dict[str, Any]]:
     """Verdict on a converged shape that minimizes an energy."""
     kind, L = HeldArm if structure.held else DiscArm, numbers["length"]
-    arm = kind(structure, numbers, load_steps.ELEMENTS)
+    arm = kind(structure, numbers, load_steps.ELEMENTS if structure.held else 24)
     unit = numbers["young"] * np.pi * numbers["radius"] ** 4 / 4 / L**2
     force = answer.support / unit / np.array([1, 1, 1, L, L, L])
     strain = answer.strain * np.array([L, L, L, 1, 1, 1])
