@@ -189,6 +189,32 @@ def test_a_push_in_the_cells_is_a_right_side():
 
 
 @pytest.mark.parametrize("apart", [False, True])
+@pytest.mark.parametrize("name", ["springs in the cells", "springs, bending only"])
+def test_a_nearly_rigid_spring_in_any_direction(name, apart):
+    """As a contact that is closed: with it the chain moves as if it were held there."""
+    of, b, stiffness = chain(6, **KINDS[name], pressed=0.3), sides(chain(6)), 1e10
+    place, normal = (1, 1), np.array([0.48, 0.64, -0.6])
+    pull = np.concatenate([np.zeros(3), normal])
+    cells = np.zeros((6, 6, *of.grid.X.shape))
+    cells[:, :, *place] = -stiffness * np.outer(pull, pull)
+    coupled = of.coupled._replace(cells=jnp.asarray(cells), part=jnp.full(of.grid.X.shape, 0.4))
+    without = of._replace(coupled=coupled._replace(cells=jnp.zeros_like(coupled.cells)))
+    push = np.zeros((3, 6, *of.grid.X.shape))
+    push[2, :, *place] = pull
+    pushed = tuple(jnp.concatenate([x, jnp.zeros((1, *x.shape[1:]))]) for x in b)
+    free, _ = without.solve(pushed, jnp.asarray(push), apart=apart)
+    moved = [
+        pull @ np.asarray(without.motions(tuple(x[i] for x in free)))[:, *place] for i in range(3)
+    ]
+    found, definiteness = of._replace(coupled=coupled).solve(b, apart=apart)
+    for x, y in zip(found, free, strict=True):
+        for i in range(2):
+            expected = y[i] - moved[i] / moved[2] * y[2]
+            np.testing.assert_allclose(x[i], expected, atol=1e-5 * np.abs(y).max())
+    assert int(definiteness.negative) == 0
+
+
+@pytest.mark.parametrize("apart", [False, True])
 @pytest.mark.parametrize("name", ["dead forces", "springs along the arm"])
 def test_stiffness_across_spans(name, apart):
     of = chain(7, **KINDS[name])

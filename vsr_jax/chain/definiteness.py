@@ -74,20 +74,36 @@ def asymmetry_of(by_rotation: Array, moment: Array | None, compliance: Array) ->
     return softest * jnp.maximum(jnp.maximum(apart[0], apart[1]), apart[2])
 
 
+def factored_block(matrix: Array, places: tuple[int, ...]) -> tuple[Array, Array, Array]:
+    """Factors whose product is the inverse of the block of a 3 x 3 matrix at given indices, zero
+    elsewhere, and the number of its negative eigenvalues if it is symmetric.
+
+    They are those of an elimination, one pivot after another, so that a nearly rigid spring is one
+    large pivot, in whatever direction it acts. In the entries of the inverse and in the determinant
+    everything else would be rounding."""
+    inside = np.isin(np.arange(3), places)
+    if len(places) < 3:
+        block = (inside[:, None] & inside).reshape(3, 3, *(1,) * (matrix.ndim - 2))
+        matrix = jnp.where(block, matrix, stacked.identity(matrix))
+    (a, b, c), (d, e, f), (g, h, i) = ((row[0], row[1], row[2]) for row in matrix)
+    second, third = d / a, g / a
+    e, f, h, i = e - second * b, f - second * c, h - third * b, i - third * c
+    last, by_second, by_third, by_last = h / e, b / a, c / a, f / e
+    pivots = jnp.stack([a, e, i - last * f])
+    zero, one = jnp.zeros_like(a), jnp.ones_like(a)
+    down = [one, zero, zero, -second, one, zero, last * second - third, -last, one]
+    up = [one, -by_second, by_last * by_second - by_third, zero, one, -by_last, zero, zero, one]
+    down, up = (jnp.stack(x).reshape(matrix.shape) for x in (down, up))
+    up = up / pivots
+    if len(places) < 3:
+        up = jnp.where(inside.reshape(3, 1, *(1,) * a.ndim), up, 0.0)
+    return up, down, jnp.sum(~(pivots > 0), axis=0, dtype=jnp.int32)
+
+
 def inverse_block(matrix: Array, places: tuple[int, ...]) -> tuple[Array, Array]:
     """Inverse of the block of a 3 x 3 matrix at given indices, zero elsewhere, and the number of
-    its negative eigenvalues if it is symmetric: the sign changes of its leading minors."""
+    its negative eigenvalues if it is symmetric."""
     if not places:
         return jnp.zeros_like(matrix), jnp.zeros(matrix.shape[2:], jnp.int32)
-    # the cube of the stiffness of a thin arm underflows in single precision
-    scale = sum((jnp.abs(matrix[i, i]) for i in places[1:]), jnp.abs(matrix[places[0], places[0]]))
-    matrix, inside = matrix / scale, np.isin(np.arange(3), places)
-    block = (inside[:, None] & inside).reshape(3, 3, *(1,) * scale.ndim)
-    if len(places) < 3:
-        matrix = jnp.where(block, matrix, stacked.identity(matrix))
-    adjugate, det = stacked.adjugate(matrix)
-    first, second, third = matrix[0, 0] > 0, adjugate[2, 2] > 0, det > 0
-    changes = (~first, first != second, second != third)
-    negative = sum((x.astype(jnp.int32) for x in changes[1:]), changes[0].astype(jnp.int32))
-    inverse = adjugate / (det * scale)
-    return inverse if len(places) == 3 else jnp.where(block, inverse, 0.0), negative
+    up, down, negative = factored_block(matrix, places)
+    return stacked.matmul(up, down), negative

@@ -45,7 +45,7 @@ from ..numerics.once import once
 from ..numerics.quadrature import Grid
 from ..numerics.stacked import blocks, columns, cross, matmul, product, rows, skew, transpose
 from .coupled import Coupled
-from .definiteness import inverse_block
+from .definiteness import factored_block
 from .nodes import at_last_nodes, block_of, whole
 
 
@@ -232,24 +232,25 @@ def solved(
     bending block."""
     bent, stretched = tuple(i for i in free if i < 3), tuple(i - 3 for i in free if i > 2)
     if not stretched:
-        compliance, negative = _inverse(D[0][0], R, bent)
-        return (matmul(compliance, right[0]),), negative, compliance
+        up, down, negative = _factored(D[0][0], R, bent)
+        return (matmul(up, matmul(down, right[0])),), negative, matmul(up, down)
     (a, b), (below, d) = D
-    flexibility, first = _inverse(d, R, stretched)
-    across = matmul(b, flexibility)
-    compliance, second = _inverse(a - product(across, below), R, bent)
-    bending = matmul(compliance, once(right[0] - product(across, right[1])))
-    stretch = matmul(flexibility, once(right[1] - product(below, bending)))
-    return (bending, stretch), first + second, compliance
+    stretch, down, first = _factored(d, R, stretched)
+    across, below, pulled = matmul(b, stretch), matmul(down, below), matmul(down, right[1])
+    bend, down, second = _factored(a - product(across, below), R, bent)
+    bending = matmul(bend, matmul(down, right[0] - product(across, pulled)))
+    stretched = matmul(stretch, pulled - product(below, bending))
+    return (bending, stretched), first + second, matmul(bend, down)
 
 
-def _inverse(matrix: Array, R: Array, places: tuple[int, ...]) -> tuple[Array, Array]:
-    """Inverse for the free strains among three of the section, and its negative eigenvalues."""
+def _factored(matrix: Array, R: Array, places: tuple[int, ...]) -> tuple[Array, Array, Array]:
+    """Factors of the inverse for the free strains among three of the section, and its negative
+    eigenvalues."""
     matrix = once(matrix)
     if len(places) == 3:
-        return inverse_block(matrix, places)
-    inverse, negative = inverse_block(_seen_from(transpose(R), matrix), places)
-    return _seen_from(R, inverse), negative
+        return factored_block(matrix, places)
+    up, down, negative = factored_block(_seen_from(transpose(R), matrix), places)
+    return matmul(R, up), matmul(down, transpose(R)), negative
 
 
 def _seen_from(R: Array, matrix: Array) -> Array:
