@@ -2,6 +2,7 @@
 along the elastica and along a rod in space, and the least energy of straight pieces with hinges
 between them, whose joints must not pass a wall."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -15,12 +16,13 @@ L, RADIUS, YOUNG = 0.2, 0.001, 5e7
 EI = YOUNG * np.pi * RADIUS**4 / 4
 
 
-def arm(load, obstacle):
+def arm(load, obstacle, start=None):
     rod = vsr.Rod(L, vsr.Circular(RADIUS), vsr.Material(YOUNG, poisson=0.4))
     scene = vsr.Scene(
         rod, (), [vsr.TipWrench(force=load)], obstacles=obstacle, free_strains=("bending_y",)
     )
-    return vsr.solve(scene, jnp.zeros(0), model=vsr.StrainDependent(24), throw=True)
+    model = vsr.StrainDependent(24)
+    return vsr.solve(scene, jnp.zeros(0), model=model, start=start, throw=True)
 
 
 def minimum(load, gaps, start):
@@ -73,12 +75,12 @@ def axis(eq, pieces):
     return np.asarray(eq.position(jnp.linspace(0, L, pieces + 1)[1:]))[:, [0, 2]]
 
 
-@pytest.mark.slow
-def test_an_arm_that_leans_on_a_pillar():
-    r"""Against shooting: $EI \theta'' = F_x \sin\theta - F_z \cos\theta$ with the force F beyond
-    each section, which the contact changes; the arm touches the pillar there, and its tip is free
-    of moments."""
-    load, centre, radius = np.array([0.0, -2.0]) / L**2, np.array([0.08, -0.012]), 0.01
+def leaning(load, centre, radius, first):
+    r"""Tip of an arm that touches a pillar, place and size of the contact force, by shooting:
+    $EI \theta'' = F_x \sin\theta - F_z \cos\theta$ with the force F beyond each section, which the
+    contact changes; the tip is free of moments. All in units of EI.
+
+    `first`: curvature at the base, place, force and direction of the contact to begin with."""
 
     def piece(force, start, end, state):
         def slope(_, y):
@@ -97,16 +99,72 @@ def test_an_arm_that_leans_on_a_pillar():
         slides = normal @ [np.cos(there[0]), np.sin(there[0])]
         return [*apart, slides, tip[1] * L], tip[2:]
 
-    first = [5.0, 0.4 * L, 6 / L**2, np.pi / 2]
     unknown = fsolve(lambda u: misses(u)[0], first, xtol=1e-13)
     assert np.abs(misses(unknown)[0]).max() < 1e-10
-    pose = vsr.pose((centre[0], 0, centre[1]), pointing=(0.0, 1.0, 0.0))
-    eq = arm((0.0, 0.0, load[1] * EI), vsr.Cylinder(radius, pose=pose))
+    return misses(unknown)[1], unknown[1], unknown[2]
+
+
+def pillar(centre, radius):
+    return vsr.Cylinder(radius, pose=vsr.pose((centre[0], 0, centre[1]), pointing=(0.0, 1.0, 0.0)))
+
+
+def assert_leans(eq, tip, place, push):
     contacts = eq.contacts
     at = int(contacts.force[0].argmax())
-    np.testing.assert_allclose(eq.tip[[0, 2], 3], misses(unknown)[1], atol=1e-6 * L)
-    np.testing.assert_allclose(contacts.X[0, at], unknown[1], atol=5e-6 * L)
-    np.testing.assert_allclose(contacts.force.sum(), unknown[2] * EI, rtol=1e-5)
+    np.testing.assert_allclose(eq.tip[[0, 2], 3], tip, atol=1e-6 * L)
+    np.testing.assert_allclose(contacts.X[0, at], place, atol=5e-6 * L)
+    np.testing.assert_allclose(contacts.force.sum(), push * EI, rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_an_arm_that_leans_on_a_pillar():
+    load, centre, radius = np.array([0.0, -2.0]) / L**2, np.array([0.08, -0.012]), 0.01
+    found = leaning(load, centre, radius, [5.0, 0.4 * L, 6 / L**2, np.pi / 2])
+    assert_leans(arm((0.0, 0.0, load[1] * EI), pillar(centre, radius)), *found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_an_arm_is_pushed_out_of_a_pillar_to_the_side_where_it_starts(side):
+    """From rest, where it crosses the pillar, to the nearer side; from a `start` to that of it."""
+    near, far, none = np.array([0.1, -0.001 * side]), np.array([0.1, 0.002 * side]), np.zeros(2)
+    first = [side * 2.0, 0.5 * L, 2.0 / L**2, side * np.pi / 2]
+    pushed = arm((0.0, 0.0, 0.0), pillar(near, 0.01))
+    assert_leans(pushed, *leaning(none, near, 0.01, first))
+    start = arm((0.0, 0.0, 0.0), pillar(far, 0.01), pushed)
+    assert_leans(start, *leaning(none, far, 0.01, first))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("steps", [12, 24])
+def test_a_thick_arm_that_slides_along_a_cylinder(steps):
+    """A chamber presses a hanging arm, with long steps, onto a cylinder in its way. Tips of the
+    least energy (SciPy's SLSQP) of 44 pieces of constant strain, whose ends and middles may not
+    pass the cylinder: with twice as many they change by 3e-5 m at most."""
+    radius, ends, pressures = 0.0211, [0.033, 0.143], jnp.linspace(0.0, 1e5, 41)
+    young = vsr.Piecewise(ends, [3.2e5, 173480.0, 3.2e5])
+    rod = vsr.Rod(
+        0.155,
+        vsr.Annular(radius, 0.0035),
+        vsr.Material(young, poisson=0.5, density=1080.0),
+        rigid=[vsr.RigidPiece(end=0.023), vsr.RigidPiece(start=0.153)],
+        base=vsr.pose(pointing="down"),
+    )
+    chamber = vsr.Chamber(vsr.Parallel(0.0, -0.012), 1.487e-4, start=ends[0], end=ends[1])
+    across = vsr.pose((0.054164, 0.018809, -0.122), pointing=(1.0, -1.0, 0.0))
+    scene = vsr.Scene(rod, chamber, vsr.Gravity(), obstacles=vsr.Cylinder(0.03, pose=across))
+
+    @jax.jit
+    @jax.vmap
+    def pressed(pressure):
+        eq = vsr.solve(scene, pressure[None], model=vsr.StrainDependent(steps))
+        return eq.status, eq.loosened, eq.tip[:3, 3]
+
+    status, loosened, tip = pressed(pressures)
+    assert np.all(status == vsr.Status.CONVERGED)
+    assert not np.any(loosened)
+    np.testing.assert_allclose(tip[26], [0.018043, -0.010416, -0.157396], atol=5e-5)
+    np.testing.assert_allclose(tip[28], [0.019336, -0.011289, -0.157346], atol=5e-5)
 
 
 @pytest.mark.slow

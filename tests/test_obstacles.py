@@ -352,8 +352,8 @@ def test_replaced_numbers_are_checked():
         SCENE.replace("obstacles[1].radius", 0.0)
     with pytest.raises(ValueError, match=r"^Scene.obstacles\[0\].normal: got 0, need"):
         SCENE.replace("obstacles[0].normal", 0.0)
-    with pytest.raises(ValueError, match=r"^Scene.obstacles\[1\]: .* inside the sphere at X = 0.2"):
-        SCENE.replace("obstacles[1].centre", (0.2, 0.05, 0.0))
+    with pytest.raises(ValueError, match=r"^Scene.obstacles\[1\]: .* inside the sphere at X = 0 m"):
+        SCENE.replace("obstacles[1].centre", (0.02, 0.05, 0.0))
     with pytest.raises(ValueError, match=r"^Scene.obstacles\[4\].radius: got 0.009 m"):
         SCENE.replace("obstacles[4].radius.tip", 0.009)
 
@@ -362,13 +362,13 @@ def depth_of(error):
     return float(str(error.value).split(" m ")[0].split()[-1])
 
 
-def test_an_arm_that_is_inside_an_obstacle_at_rest():
-    bent = arm(rest_strain=(0, 0, np.pi / 2 / 0.3, 1, 0, 0), base=vsr.pose((0, 0.1, 0)))
-    tip = np.array([0.3, 0.3, 0.0]) * 2 / np.pi + (0, 0.1, 0)  # of a quarter of a circle
-    with pytest.raises(ValueError, match=r"obstacles\[1\]: .* at X = 0.3 m") as error:
-        vsr.Scene(bent, obstacles=[vsr.Plane((0, 1, 0)), vsr.Plane((0, -1, 0), (0, tip[1], 0))])
-    np.testing.assert_allclose(depth_of(error), 0.01, rtol=1e-2)
-    vsr.Scene(bent, obstacles=[vsr.Plane((0, -1, 0), (0, tip[1] + 0.010001, 0))])
+def test_an_arm_may_cross_obstacles_at_rest_but_must_start_outside():
+    vsr.Scene(arm(), obstacles=[vsr.Sphere((0.2, 0.0, 0.0), 0.05)])
+    with pytest.raises(
+        ValueError, match=r"obstacles\[1\]: .* inside the plane at X = 0 m"
+    ) as error:
+        vsr.Scene(arm(), obstacles=[vsr.Plane((0, 0, 1), (0, 0, -0.01)), vsr.Plane((0, 1, 0))])
+    np.testing.assert_allclose(depth_of(error), 0.01, rtol=1e-6)
     # the arm touches
     vsr.Scene(arm(), obstacles=[vsr.Plane((0, 0, 1), (0, 0, -0.01))])
 

@@ -25,10 +25,11 @@ from .functions import Position, function_of_position
 
 
 class Obstacle(Part):
-    r"""A rigid obstacle fixed in the world. One that `encloses` the arm is a lumen: the arm must
-    start inside it, and elsewhere may be beyond its wall at rest. One that an arm `lies_along`, as
-    its contacts are seldom in separate places, may be touched by the ends of its steps too, if it
-    has no friction.
+    r"""A rigid obstacle fixed in the world. The arm must start outside it, and is pushed out of it
+    where it crosses it at rest, to the side that is nearer (`solve(start=)` chooses another). One
+    that `encloses` the arm is a lumen, in which the arm must start. One that an arm `lies_along`,
+    as its contacts are seldom in separate places, may be touched by the ends of its steps too, if
+    it has no friction.
 
     `friction` is the coefficient $\mu$ [-] of Coulomb friction between arm and obstacle, None
     without. It acts along a path of inputs: see `vsr_jax.follow`.

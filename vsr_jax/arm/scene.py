@@ -104,8 +104,8 @@ class Scene(Part):
     - a thread ends or a load acts beyond the arm,
     - a rigid piece is beyond the arm, two of them overlap, or they cover all of the arm,
     - there is gravity and the material has no density,
-    - an obstacle has no size, a tube is narrower than the arm, or the arm is inside an obstacle at
-      rest or starts outside a tube.
+    - an obstacle has no size, a tube is narrower than the arm, or the arm starts inside an obstacle
+      or outside a tube.
 
     Only known numbers are checked, not those traced by `jax.jit`.
     """

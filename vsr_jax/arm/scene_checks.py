@@ -1,5 +1,5 @@
 """Checks of the known numbers of a scene: sizes and properties, the paths of threads, places on the
-arm, and the room that obstacles leave to the arm at rest."""
+arm, and the room that obstacles leave to it."""
 
 from collections.abc import Callable, Sequence
 
@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..numerics.compiling import program
-from ..numerics.magnus import step_poses
-from ..numerics.quadrature import make_grid
+from ..numerics.se3 import base_pose
 from ..typing import Scalar
 from ..validation import ROUNDING, concrete, is_traced, numbers
 from .actuator import Actuator
@@ -25,8 +24,6 @@ from .rod import Rod
 _PROBES = 65
 """Evenly spaced abscissas at which limits are checked, besides the breakpoints and the middles
 between them."""
-_STEPS = 64
-"""Steps along the arm at rest, at whose ends the room is checked."""
 
 
 def check_numbers(
@@ -134,15 +131,14 @@ def check_obstacles(
     rod: Rod, obstacles: Sequence[Obstacle], edges: Callable[[], Float[Array, " edges"]]
 ) -> None:
     """Raises `ValueError` for an obstacle of no size, a tube narrower than the arm, and an arm that
-    at rest is inside an obstacle, or starts outside a tube, for known numbers.
+    starts where it cannot be, for known numbers.
 
     **Arguments:** `edges`: as for `check_numbers`.
     """
     if not obstacles:
         return
-    X, positions, outline = _at_rest(rod, edges())
-    X, radii = concrete(X), concrete(outline)
-    if X is None or radii is None:
+    start, radii = map(concrete, _room_needed(rod, edges()))
+    if start is None or radii is None:
         return
     for i, obstacle in enumerate(obstacles):
         name = f"Scene.obstacles[{i}]"
@@ -151,34 +147,26 @@ def check_obstacles(
             if known is not None and not known > 0:
                 raise ValueError(f"{name}.{size}: got {known:g}, need a number > 0")
         obstacle.check(name, float(np.max(radii)))
-        stations = slice(0, 1) if obstacle.encloses else slice(None)
-        distances = concrete(_distances(obstacle, positions[stations]))
-        if distances is None:
+        distance = concrete(_distance(obstacle, start))
+        if distance is None:
             continue
-        gap = distances - radii[stations]
-        j = int(np.argmin(gap))
-        if not gap[j] > -ROUNDING * X[-1]:
-            where, needed = (
-                ("outside", f"an arm that starts in the {obstacle.effect}")
-                if obstacle.encloses
-                else ("inside", "an arm that is outside at rest")
-            )
+        gap = float(distance - radii[0])
+        if not gap > -ROUNDING * float(rod.length):
+            at, needed = ("outside", "in") if obstacle.encloses else ("inside", "outside")
             raise ValueError(
-                f"{name}: the arm at rest is {-gap[j]:.3g} m {where} the {obstacle.effect} at "
-                f"X = {X[j]:g} m, its outline of {radii[j]:g} m included; need {needed}"
+                f"{name}: the arm starts {-gap:.3g} m {at} the {obstacle.effect} at X = 0 m, its "
+                f"outline of {radii[0]:g} m included; need an arm that starts {needed} the "
+                f"{obstacle.effect}"
             )
 
 
 @program("Scene")
-def _at_rest(rod: Rod, edges: Array) -> tuple[Array, Array, Array]:
-    """Abscissas [m] along the arm, its positions there at rest, and the radii of its outline."""
-    grid = make_grid(edges, _STEPS, 3)
-    strain = jax.vmap(jax.vmap(rod.rest))(grid.X)
-    poses = step_poses(tuple(strain), grid.h, rod.frame)
-    X = jnp.append(grid.start, rod.length)
-    return X, poses[:, :3, 3], jax.vmap(rod.outline)(X)
+def _room_needed(rod: Rod, edges: Array) -> tuple[Array, Array]:
+    """Position of the start of the arm [m], and radii of its outline [m] from there on."""
+    X = jnp.concatenate([jnp.linspace(0, 1, _PROBES) * rod.length, edges])
+    return jnp.asarray(base_pose(rod.frame, X.dtype))[:3, 3], jax.vmap(rod.outline)(X)
 
 
 @program("Scene")
-def _distances(obstacle: Obstacle, positions: Array) -> Array:
-    return jax.vmap(obstacle.distance)(positions)
+def _distance(obstacle: Obstacle, position: Array) -> Array:
+    return obstacle.distance(position)
