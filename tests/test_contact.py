@@ -109,7 +109,7 @@ def test_an_arm_on_a_floor_says_that_its_contacts_are_loosened():
             start=start,
         )
 
-    eqs = jax.jit(jax.vmap(on_floor))(jnp.array([30.0, 5000.0]))
+    eqs = jax.jit(jax.vmap(on_floor))(jnp.array([30.0, 6000.0]))
     heavy = jax.tree.map(lambda x: x[1], eqs)
     lighter = jax.jit(on_floor)(jnp.array(4000.0), heavy)
     assert np.all(eqs.converged)
@@ -325,6 +325,21 @@ def test_single_precision(pressed):
     eq = vsr.solve(scene, NO_INPUTS.astype(jnp.float32), model=MODEL)
     assert eq.tip.dtype == jnp.float32
     np.testing.assert_allclose(eq.tip, pressed.tip, atol=2e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("obstacle", [vsr.Plane((0, 0, 1), (0, 0, -1)), vsr.Sphere((0, 1, 0), 0.1)])
+def test_what_a_limp_rope_does_not_touch_changes_nothing(obstacle):
+    r"""In single precision; it hangs by its weight alone, $L + \rho g L^2 / 2 E$."""
+    length, young, density = 0.61, 0.3e6, 1000.0
+    material = vsr.Material(young, shear=young / 3, density=density)
+    rope = vsr.Rod(length, vsr.Circular(1e-3), material)
+    scene = vsr.Scene(rope, loads=vsr.Gravity((9.81, 0, 0)), obstacles=obstacle)
+    eq = vsr.solve(scene, jnp.zeros(0, jnp.float32), model=vsr.StrainDependent(64))
+    assert eq.status == vsr.Status.CONVERGED
+    assert not eq.loosened
+    expected = length * (1 + density * 9.81 * length / (2 * young))
+    np.testing.assert_allclose(eq.tip[:3, 3], [expected, 0, 0], atol=1e-6)
 
 
 def test_scene_files_keep_held_sections(pressed):

@@ -65,7 +65,10 @@ class Chain(NamedTuple):
         b, push = self._sides(right, push)
         if coupled.motion < 6:
             return self._by_steps(coupled, b)
-        by_nodes = apart or b.ndim > 4
+        # by steps, single precision loses signs of pivots of a limp arm under tension, for which a
+        # step without what lies beyond it is indefinite
+        limp = push is not None and b.dtype == jnp.float32
+        by_nodes = apart or b.ndim > 4 or limp
         hinges = self._hinges(coupled, b, push, 0 if by_nodes else 6)
         passed = solved_by_hinges if by_nodes else solved_by_joints
         strain, negative, asymmetry = passed(hinges, self.grid, self.free)
