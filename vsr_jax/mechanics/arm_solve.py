@@ -51,9 +51,12 @@ _LANES, _QUEUED = 48, 1024
 most: some need four times as many steps as most."""
 
 _BOW = 0.05
-"""Angle [rad] by which an arm with constraints is bent and twisted at rest in a second attempt,
-until these are exact. Without it, the attempt ends on symmetric shapes that are unstable
-(`test_an_arm_held_with_slack_finds_its_stable_shape` in tests/test_held.py)."""
+"""Angle [rad] by which an arm with constraints is bent and twisted at rest until these are exact,
+where contacts are loosened, and in the second attempt of an arm without contacts. Otherwise
+symmetric shapes that are unstable are found in place of those beside them
+(`test_an_arm_held_with_slack_finds_its_stable_shape` in tests/test_held.py). With contacts, a solve
+from a `start` is not bent: that might take the arm to another side of an obstacle
+(`test_an_arm_that_has_buckled_in_a_tube` in tests/test_contact_tube.py)."""
 
 _START_STEPS = 4
 """Fixed-point steps to the start: each gains a factor of the strains that threads cause."""
@@ -295,9 +298,10 @@ def _iteration(
 
     def evaluate(point: _Point, damping: Array, stage: Stage) -> Damped:
         problem = whole.loosened(stage.loose).with_share(stage.share)
-        if whole.constrained:
+        if whole.constrained and (guess is None or not whole.begins_soft):
+            bent = stage.loose if whole.begins_soft else stage.restarted
             soft = jnp.clip(2.0 - stage.share, 0.0, 1.0)
-            problem = problem.bowed(jnp.where(stage.restarted, _BOW * soft, 0.0))
+            problem = problem.bowed(jnp.where(bent, _BOW * soft, 0.0))
         unknown = _unknown(point, whole, free)
         imbalance, changes, at = _linearized(unknown, problem, free)
         step, definite, doubtful = approximate_solve(unknown, at, imbalance, problem, free, damping)
