@@ -147,8 +147,11 @@ class ArmProblem(NamedTuple):
 
     @property
     def hardens(self) -> bool:
-        """Whether a coupling is softer on the way to a solution."""
-        return any(one.hardens for one in self.couplings)
+        """Whether couplings are softer on the way to a solution. Springs of threads alone are not
+        where these rub, since they only help where there is an energy: six rubbing cables of given
+        length that bend an arm there and back are then not solved at every sample."""
+        energy = self.constrained or not self.follows_rate
+        return energy and any(one.hardens for one in self.couplings)
 
     @property
     def begins_soft(self) -> bool:
