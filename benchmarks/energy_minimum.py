@@ -168,7 +168,7 @@ class HeldArm(EnergyArm):
         def augmented(xi: np.ndarray) -> float:
             off, _ = self.deviation(xi)
             self.support(np.zeros(self.rows))
-            return self.energy(xi) - force @ off + 0.5 * SPRING * off @ off
+            return self.energy(xi) + float((0.5 * SPRING * off - force) @ off)
 
         def system(xi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             off, G = self.deviation(xi)
@@ -230,7 +230,7 @@ class DiscArm(EnergyArm):
         lengths, slopes = [], []
         for hole in self.holes:
             points = [ends[stop, :3, :3] @ hole + ends[stop, :3, 3] for stop in self.stops]
-            moves = [self.moved(p, k, middle) for p, k in zip(points, self.stops, strict=True)]
+            moves = [self.moved(p, int(k), middle) for p, k in zip(points, self.stops, strict=True)]
             chords, turns = np.diff(points, axis=0), np.diff(moves, axis=0)
             each = np.linalg.norm(chords, axis=1)
             lengths.append(np.sum(each))

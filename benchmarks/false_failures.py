@@ -170,20 +170,25 @@ def _sought_minimum(structure: Structure, numbers: Numbers) -> tuple[str, dict[s
 def _confirmed_minimum(
     structure: Structure, numbers: Numbers, answer: Answer
 ) -> tuple[str, dict[str, Any]]:
-    """Verdict on a converged shape that minimizes an energy."""
-    kind, L = HeldArm if structure.held else DiscArm, numbers["length"]
-    arm = kind(structure, numbers, load_steps.ELEMENTS if structure.held else 24)
+    """Verdict on a converged shape that minimizes an energy, if necessary on a finer mesh."""
+    L, record = numbers["length"], {}
+    kind, elements = (HeldArm, load_steps.ELEMENTS) if structure.held else (DiscArm, 24)
     unit = numbers["young"] * np.pi * numbers["radius"] ** 4 / 4 / L**2
     force = answer.support / unit / np.array([1, 1, 1, L, L, L])
-    strain = answer.strain * np.array([L, L, L, 1, 1, 1])
-    record = {"turn": arm.turn(strain)}
-    found = arm.finished(strain, force[: 3 if structure.held == "pinned" else 6])
-    if found is None or np.max(np.abs(arm.places(found.strain) - arm.places(strain))) > COARSE:
-        return "wrong: another shape", record
-    record["margin"] = found.margin
-    if found.margin <= 0:
-        return "wrong: not stable", record
-    return ("converged, beyond a turn" if record["turn"] > A_TURN else "converged"), record
+    said = "wrong: another shape"
+    for finer in (1, 3):
+        arm = kind(structure, numbers, finer * elements)
+        strain = np.repeat(answer.strain * np.array([L, L, L, 1, 1, 1]), finer, axis=0)
+        strain = strain[:: load_steps.ELEMENTS // elements]
+        record = {"turn": arm.turn(strain)}
+        found = arm.finished(strain, force[: 3 if structure.held == "pinned" else 6])
+        if found is None or np.max(np.abs(arm.places(found.strain) - arm.places(strain))) > COARSE:
+            continue
+        record["margin"] = found.margin
+        if found.margin > 0:
+            return ("converged, beyond a turn" if record["turn"] > A_TURN else "converged"), record
+        said = "wrong: not stable"
+    return said, record
 
 
 def search(name: str, count: int, seed: int, gradients: bool = False) -> dict[str, Any]:
