@@ -205,3 +205,72 @@ def test_a_start_of_another_model_is_refused():
     start = vsr.solve(soft(), [1.0], model=vsr.StrainDependent(8))
     with pytest.raises(ValueError, match="start: got an equilibrium by StrainDependent"):
         vsr.follow(soft(), [[1.0]], model=MODEL, start=start)
+
+
+CRITICAL = 17.3
+"""Angle [rad] at which a shaft between clamps buckles with T L^2 / EI = 31.8: M L / EI = 13.3."""
+
+
+def hinged(angle):
+    """An arm with a rubbing tendon whose tip a gripper turns and moves, from a base that turns."""
+    rod = vsr.Rod(
+        LENGTH,
+        vsr.Circular(0.01),
+        vsr.Material(1e6, poisson=0.45, density=1000.0),
+        base=vsr.pose(pointing=jnp.stack([jnp.cos(angle), 0.0 * angle, jnp.sin(angle)])),
+    )
+    tendon = vsr.Tendon(vsr.Parallel(0.007, 0.0), friction=MU)
+    load = vsr.TipWrench(force=(0.0, 0.1 * angle, 0.0))
+    return vsr.Scene(rod, tendon, [vsr.Gravity(), load])
+
+
+def test_a_path_of_one_scene_is_a_path_of_equal_scenes():
+    angle, tensions = jnp.full(5, 0.3), jnp.array([0.0, 2.0, 4.0, 3.0, 1.0])[:, None]
+    one = vsr.follow(hinged(angle[0]), tensions, model=MODEL)
+    each = vsr.follow(jax.vmap(hinged)(angle), tensions, model=MODEL)
+    tips = jax.vmap(lambda eq: eq.tip)
+    np.testing.assert_allclose(tips(each), tips(one), atol=1e-13)
+
+
+@pytest.mark.slow
+def test_turns_are_counted_along_a_path_of_held_orientations():
+    """A rod under tension between two clamps, the far one turned by three whole turns: its moment
+    is G J times the twist, where a solve from rest finds no twist at whole turns. Beyond the
+    critical angle the straight rod snaps, and the path says so."""
+    rod = vsr.Rod(1.0, vsr.Circular(0.02), vsr.Material(1e9, poisson=0.3))
+    turns = jnp.linspace(0, 6 * jnp.pi, 25)
+
+    def scene_of(angle):
+        c, s = jnp.cos(angle), jnp.sin(angle)
+        one, zero = jnp.ones_like(angle), jnp.zeros_like(angle)
+        turned = jnp.stack([one, zero, zero, zero, c, -s, zero, s, c]).reshape(3, 3)
+        held = vsr.Held(position=(1.0, 0.0, 0.0), orientation=turned, along=(1.0, 0.0, 0.0))
+        pull = vsr.TipWrench(force=(4e3, 0.0, 0.0))
+        return vsr.Scene(rod, (), pull, held=held)
+
+    scenes = jax.vmap(scene_of)(turns)
+    path = vsr.follow(scenes, jnp.zeros((25, 0)), model=vsr.StrainDependent(8))
+    assert np.all(path.status == 0)
+    stiffness = 1e9 / 2.6 * np.pi / 2 * 0.02**4
+    moment = jax.vmap(lambda eq: eq.supports[0, 0])(path)
+    straight = turns < CRITICAL
+    np.testing.assert_allclose(moment[straight], stiffness * turns[straight], atol=1e-6)
+    assert not np.any(path.restarted[straight])
+    assert path.restarted[np.sum(straight)]
+
+
+def test_scenes_and_inputs_of_a_path_are_as_many():
+    scenes = jax.vmap(hinged)(jnp.linspace(0, 0.2, 3))
+    with pytest.raises(ValueError, match=r"got one for each of \(3,\) samples, need .* 4"):
+        vsr.follow(scenes, jnp.zeros((4, 1)), model=MODEL)
+
+
+@pytest.mark.slow
+def test_a_base_that_turns_leaves_the_friction_of_its_way():
+    """As the arm becomes straighter its tendon slips, and keeps that tension on the way back."""
+    angle, tension = jnp.array([0.8, 0.4, 0.0, 0.4, 0.8]), jnp.full((5, 1), 3.0)
+    path = vsr.follow(jax.vmap(hinged)(angle), tension, model=MODEL)
+    assert np.all(path.status == 0)
+    at_tip = -jax.vmap(lambda eq: eq.nodes.tau(eq.sound_forces)[0][-1, -1])(path)
+    assert np.all(np.diff(at_tip[:3]) > 1e-3)
+    np.testing.assert_allclose(at_tip[2:], at_tip[2], rtol=1e-9)

@@ -1,4 +1,4 @@
-r"""`follow`: equilibria along a path of inputs, each from the one before it.
+r"""`follow`: equilibria along a path of inputs and scenes, each from the one before it.
 
 The path is quasi-static: the arm is in equilibrium at every sample. Each solve starts from the
 equilibrium before, so that of several stable equilibria the arm stays in its own until that one
@@ -39,8 +39,8 @@ def follow(
     model: Model | None = None,
     start: Equilibrium | None = None,
 ) -> Equilibrium:
-    r"""Equilibria along a path of inputs, in order, with the history of friction, of tendons and of
-    contact with obstacles.
+    r"""Equilibria along a path of inputs and scenes, in order, with the history of friction, of
+    tendons and of contact with obstacles.
 
     Where a tendon has friction its tension follows $T_j(X) = \min(\max(T_{j-1}(X), T_j e^{-\mu
     \varphi(X)}), T_j e^{\mu \varphi(X)})$ from one sample to the next: after a reversal it slips
@@ -57,8 +57,13 @@ def follow(
     Without friction the equilibria are those of `solve(start=)`: of several stable ones the arm
     stays in the one that it is in.
 
+    A path may also move the base, held sections, loads or any other number of the scene: `scene` is
+    then that of every sample, as `jax.vmap(scene_of)(t)` makes it from a function of one parameter
+    and its values in order.
+
     **Arguments:**
-    - `scene`: one scene for the whole path.
+    - `scene`: one scene for the whole path, or one with a leading axis of samples in all its
+      numbers. Obstacles with friction must not move: slip is that over the world.
     - `inputs`: shape (samples, actuators), in order. Their dtype is the precision.
     - `model`: a `StrainDependent`, the default.
     - `start`: where the path begins: an equilibrium of the same scene and model, for example the
@@ -70,8 +75,8 @@ def follow(
     sample without an equilibrium has a status as of `solve`; the next one continues from the last
     that has one. Differentiable with respect to the inputs, the scene and `start`.
 
-    **Raises:** `ValueError` for inputs of a wrong shape, another model, and a start of another
-    model or with other actuators.
+    **Raises:** `ValueError` for inputs of a wrong shape, another number of scenes, another model,
+    and a start of another model, with other actuators or, for several scenes, other parts.
     """
     instance("scene", scene, Scene, "a Scene")
     model = StrainDependent() if model is None else model
@@ -81,9 +86,17 @@ def follow(
         )
     values = _path(scene, inputs)
     scene = cast(scene, values.dtype)
-    before = model.at_rest(scene, values.dtype) if start is None else _start(start, scene, model)
+    first = jax.tree.map(lambda x: x[0], scene) if _several(scene) else scene
+    before = model.at_rest(first, values.dtype) if start is None else _start(start, scene, model)
     outcomes = _follow(scene, cast(before, values.dtype), values)
-    return jax.vmap(lambda u, outcome: Equilibrium(scene, u, model, outcome))(values, outcomes)
+    each = (0 if _several(scene) else None, 0, 0)
+    made = jax.vmap(lambda scene, u, outcome: Equilibrium(scene, u, model, outcome), each)
+    return made(scene, values, outcomes)
+
+
+def _several(scene: Scene) -> bool:
+    """Whether there is a scene for each sample."""
+    return jnp.ndim(scene.rod.length) > 0
 
 
 def _path(scene: Scene, inputs: ArrayLike) -> Array:
@@ -93,6 +106,11 @@ def _path(scene: Scene, inputs: ArrayLike) -> Array:
             f"inputs: got shape {values.shape}, need (samples, {len(scene.actuators)}), one row "
             f"per sample"
         )
+    if _several(scene) and scene.rod.length.shape != values.shape[:1]:
+        raise ValueError(
+            f"scene: got one for each of {scene.rod.length.shape} samples, need one scene or "
+            f"{len(values)}, as many as inputs"
+        )
     return values
 
 
@@ -100,21 +118,33 @@ def _start(start: Equilibrium, scene: Scene, model: Model) -> Near:
     near = near_of(scene, start)
     if near.model != model:
         raise ValueError(f"start: got an equilibrium by {near.model}, need one by {model}")
-    return near._replace(scene=scene)
+    if not _several(scene):
+        return near._replace(scene=scene)
+    if jax.tree.structure(near.scene) != jax.tree.structure(scene):
+        raise ValueError(
+            "start: got an equilibrium of a scene with other parts, need those of the path's scenes"
+        )
+    return near
 
 
 @program("follow")
 def _follow(scene: Scene, before: Near, inputs: Array) -> Outcome:
     model = before.model
 
-    def proceed(carry: tuple, values: Array) -> tuple[tuple, Outcome]:
-        near = Near(model, scene, *carry)
+    def proceed(carry: tuple, sample: tuple) -> tuple[tuple, Outcome]:
+        last, *solution = carry
+        values, own = sample
+        near = Near(model, scene if last is None else last, *solution)
         outcome = checked_outcome(
-            scene, values, model, lambda scene, u: model.solve_after(scene, u, near)
+            scene if own is None else own,
+            values,
+            model,
+            lambda scene, u: model.solve_after(scene, u, near),
         )
         found = outcome.status == Status.CONVERGED
-        after = (outcome.forces, outcome.state)
+        after = (own, outcome.forces, outcome.state)
         return jax.tree.map(lambda a, b: jnp.where(found, a, b), after, carry), outcome
 
-    start = (before.forces, model.remembered(before).state)
-    return scan(proceed, start, inputs)[1]
+    several = _several(scene)
+    start = (before.scene if several else None, before.forces, model.remembered(before).state)
+    return scan(proceed, start, (inputs, scene if several else None))[1]
