@@ -324,12 +324,12 @@ def _iteration(
         Measures(sizes.work, sizes.turn, sizes.stirs(start), dot),
         start,
         floor,
-        _schedule(whole, guess),
+        schedule_of(whole, guess),
         None if guess is None else origin,
     )
 
 
-def _schedule(problem: ArmProblem, guess: ArmUnknown | None) -> Schedule:
+def schedule_of(problem: ArmProblem, guess: ArmUnknown | None = None) -> Schedule:
     """Load increments and stages of a problem that begins from a guess or from rest."""
     loaded = problem.loads is not None and not problem.begins_soft
     return Schedule(

@@ -15,20 +15,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from ..mechanics.arm_balance import rounding_of, state_of as arm_state_of
+from ..mechanics.arm_solve import schedule_of
 from ..mechanics.balance import ALL, residual, without_force
 from ..mechanics.coupling import ArmProblem, ArmState, borders_of
 from ..numerics import component as c, lu
 from ..numerics.batching import arms_in, iterated, side_by_side
 from ..numerics.component import Vector
-from ..numerics.damped_newton import (
-    LOAD_INCREMENTS,
-    MAX_TURN,
-    Damped,
-    Measures,
-    Schedule,
-    Stage,
-    damped_newton,
-)
+from ..numerics.damped_newton import MAX_TURN, Damped, Measures, Stage, damped_newton
 from ..numerics.implicit import implicit_root
 from ..numerics.newton import Root
 from ..numerics.quadrature import Grid
@@ -311,11 +304,9 @@ def _solve(basis: NodalBasis, problem: ArmProblem) -> Root:
     first = start(jnp.zeros((size, *arms), K.dtype), problem)
     first = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(x), *arms)), first)
     floor = jnp.broadcast_to(rounding_of(problem), arms)
-    loaded = problem.loads is not None
-    schedule = Schedule(LOAD_INCREMENTS if loaded else 1, direct=loaded)
     stirs = jax.tree.map(jnp.zeros_like, first)._replace(q=_stirs(K, arms))
     measures = Measures(work, turn, stirs, dot if problem.follows_rate else None)
-    return iterated(damped_newton(evaluate, measures, first, floor, schedule))
+    return iterated(damped_newton(evaluate, measures, first, floor, schedule_of(problem)))
 
 
 def _stirs(K: Array, arms: Shape) -> Array:
