@@ -69,7 +69,7 @@ class EnergyArm(Arm):
                 damping = max(4 * damping, 1e-3)
                 continue
             step = np.linalg.solve(factor.T, np.linalg.solve(factor, r))
-            if damping == 0 and np.linalg.norm(self.scale * step) < 1e-6:
+            if np.linalg.norm(self.scale * step) < (1e-6 if damping == 0 else 1e-9):
                 break
             there = xi - step.reshape(-1, 6)
             new = energy(there)
