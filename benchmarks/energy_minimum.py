@@ -24,7 +24,7 @@ BOWS, BOW = 6, 1.0
 """Number of searches, and angle [rad] by which the first ones are bowed at their start."""
 SPRING = 300.0
 """Stiffness k of the springs, in $EI / L^3$; those for angles are as stiff in $EI / L$."""
-OUTER, INNER, FINISHING = 40, 400, 30
+OUTER, INNER, FINISHING = 40, 100, 30
 BALANCED = 1e-8
 """Norm of the last step that counts as rounding: of strains by the square root of their energy."""
 
