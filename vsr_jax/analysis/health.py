@@ -16,7 +16,7 @@ from jaxtyping import Array
 
 from ..arm.scene import Scene
 from ..files.output import plain
-from ..mechanics.balance import thread_direction, thread_wrench
+from ..mechanics.balance import unit_wrench
 from ..models.base import Model, Status
 from ..numerics.compiling import program
 from ..numerics.component import free_components, norm, scale, split, times
@@ -266,9 +266,7 @@ def _independence(scene: Scene) -> Scalar:
     """Least eigenvalue of the matrix of eq. (20) at rest, scaled to ones on its diagonal."""
     grid = make_grid(scene.edges(), 32, 3)
     sections = scene.sections(grid.X)
-    wrenches = [
-        thread_wrench(thread_direction(sections.rest, path)[0], path) for path in sections.paths
-    ]
+    wrenches = [unit_wrench(sections.rest, path) for path in sections.paths]
     wrenches = [
         free_components(w if reach is None else scale(reach, w), scene.free)
         for w, reach in zip(wrenches, sections.reach, strict=True)

@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from ..arm.loads import Gravity
+from ..arm.rod import Rod
 from ..arm.scene import Scene
-from ..mechanics.balance import thread_direction, thread_wrench
+from ..mechanics.balance import unit_wrench
 from ..numerics.compiling import program
 from ..numerics.component import times
 from ..solution.equilibrium import Equilibrium
@@ -210,17 +211,15 @@ def _measured(scene: Scene) -> _Measures:
 @program("check")
 def _strain_by_inputs(scene: Scene, inputs: Array) -> Array:
     """Largest strain that each input alone causes, to first order; 0 where it drives a law."""
-    rod, zero = scene.rod, jnp.zeros_like(scene.rod.length)
-    X = jnp.linspace(0, 1, _STATIONS) * rod.length
-    sections, forces = scene.sections(X), scene.forces(inputs)
-    thickness = jax.vmap(lambda x: rod.section.clearance(zero, zero, x, rod.length))(X)
-    sizes = [thickness] * 3 + [jnp.ones_like(thickness)] * 3
+    X = jnp.linspace(0, 1, _STATIONS) * scene.rod.length
+    sections, forces, sizes = scene.sections(X), scene.forces(inputs), _sizes(scene.rod, X)
+    zero = jnp.zeros_like(scene.rod.length)
 
     def of_thread(i: int) -> Array:
         if i in scene.law_driven:
             return zero
         path = sections.paths[i]
-        wrench = thread_wrench(thread_direction(sections.rest, path)[0], path)
+        wrench = unit_wrench(sections.rest, path)
         parts = zip(sizes, wrench, sections.stiffness, strict=True)
         unit = jnp.stack([jnp.abs(size * part / k) for size, part, k in parts])
         there = times(sections.reach[i], times(sections.flexible, unit))
@@ -231,11 +230,16 @@ def _strain_by_inputs(scene: Scene, inputs: Array) -> Array:
 
 @program("check")
 def _largest_strain(eq: Equilibrium) -> Array:
-    nodes, rod = eq.nodes, eq.scene.rod
-    zero = jnp.zeros_like(rod.length)
-    thickness = jax.vmap(lambda x: rod.section.clearance(zero, zero, x, rod.length))(
-        nodes.grid.X.reshape(-1)
-    ).reshape(nodes.grid.X.shape)
+    nodes = eq.nodes
+    sizes = _sizes(eq.scene.rod, nodes.grid.X)
     off = [x - rest for x, rest in zip(nodes.xi, nodes.sections.rest, strict=True)]
-    sizes = [thickness] * 3 + [jnp.ones_like(thickness)] * 3
     return jnp.max(jnp.stack([jnp.abs(size * x) for size, x in zip(sizes, off, strict=True)]))
+
+
+def _sizes(rod: Rod, X: Array) -> list[Array]:
+    """Factors at abscissas X from the six strain components to strains of the material: the half
+    thickness of the section for those that bend and twist it, 1 for the others."""
+    zero = jnp.zeros_like(rod.length)
+    each = jax.vmap(lambda x: rod.section.clearance(zero, zero, x, rod.length))
+    thickness = each(X.reshape(-1)).reshape(X.shape)
+    return [thickness] * 3 + [jnp.ones_like(thickness)] * 3

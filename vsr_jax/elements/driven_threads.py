@@ -26,7 +26,7 @@ from ..arm.actuator import Actuator, ThreadState
 from ..arm.scene import CrossSections, Scene
 from ..chain import Border
 from ..mechanics.applied_load import Exerted, finite
-from ..mechanics.balance import largest_force_scale, thread_direction, thread_wrench
+from ..mechanics.balance import largest_force_scale, thread_direction, unit_wrench
 from ..mechanics.coupling import ArmProblem, ArmState, Scales, ThreadRule
 from ..mechanics.sizes import pull_of
 from ..numerics import component as c
@@ -166,7 +166,7 @@ class DrivenThreads(ThreadRule):
             pull = pull_on(at.exerted, place)
             if pull is None or at.along is None:
                 path = problem.sections.paths[place]
-                wrench = thread_wrench(thread_direction(at.xi, path)[0], path)
+                wrench = unit_wrench(at.xi, path)
                 pulls.append(c.times(at.carried.gains[place], wrench))
                 lengths.append(c.times(problem.sections.reach[place], wrench))
             else:
@@ -239,7 +239,7 @@ def _compliance_of_arm(sections: CrossSections, place: int, grid: Grid) -> Array
     r"""By how much the path of a thread becomes shorter per unit of its tension, at rest [m/N]:
     $\int b^T \Sigma^{-1} b \, dX$ of the wrench b of a unit force."""
     path = sections.paths[place]
-    wrench = thread_wrench(thread_direction(sections.rest, path)[0], path)
+    wrench = unit_wrench(sections.rest, path)
     parts = [part**2 / s for part, s in zip(wrench, sections.stiffness, strict=True)]
     per_length = c.times(sections.flexible, sum(parts[1:], parts[0]))
     return jnp.sum(grid.weight * c.times(sections.reach[place], per_length), axis=(0, 1))

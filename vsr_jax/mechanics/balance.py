@@ -91,11 +91,16 @@ def thread_wrench(t: Vector, path: Path) -> Vector:
     return (path.y * t[2] - path.z * t[1], path.z * t[0], -path.y * t[0], *t)
 
 
+def unit_wrench(xi: Vector, path: Path) -> Vector:
+    """Wrench of a thread per unit of its force, at a strain."""
+    return thread_wrench(thread_direction(xi, path)[0], path)
+
+
 def actuation_wrench(xi: Vector, sections: CrossSections, tau: Forces) -> Vector:
     """Wrench of all threads (eq. 17): $F_a = B_\\tau(\\xi) \\tau$."""
 
     def more(total: Vector, path: Path, force: Array) -> Vector:
-        return add(total, scale(force, thread_wrench(thread_direction(xi, path)[0], path)))
+        return add(total, scale(force, unit_wrench(xi, path)))
 
     return over_threads(more, tuple(jnp.zeros_like(x) for x in xi), sections.paths, tau)
 

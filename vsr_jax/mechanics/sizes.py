@@ -9,7 +9,7 @@ from ..arm.scene import CrossSections
 from ..numerics import component as c
 from ..numerics.component import Vector
 from ..numerics.quadrature import Grid
-from .balance import thread_direction, thread_wrench
+from .balance import unit_wrench
 
 
 def shape_size(strain: Vector, length: Array) -> Array:
@@ -30,7 +30,7 @@ def shape_of(wrench: Vector, sections: CrossSections, length: Array) -> Array:
 
 def pull_of(sections: CrossSections, path: Path, length: Array) -> Array:
     """`shape_size` of the strain per unit of a thread's force at rest [1/N]."""
-    wrench = thread_wrench(thread_direction(sections.rest, path)[0], path)
+    wrench = unit_wrench(sections.rest, path)
     return shape_of(wrench, sections, length)
 
 

@@ -17,8 +17,7 @@ from ..mechanics.balance import (
     residual,
     rounding_floor,
     tangent,
-    thread_direction,
-    thread_wrench,
+    unit_wrench,
     without_force,
 )
 from ..mechanics.coupling import ArmProblem, forces_at
@@ -267,9 +266,7 @@ def actuation_matrix(
     sections = projection.sections
     columns = []
     for path, share in zip(sections.paths, sections.carry(ones), strict=True):
-        columns.append(
-            projection.integrate(c.scale(share, thread_wrench(thread_direction(xi, path)[0], path)))
-        )
+        columns.append(projection.integrate(c.scale(share, unit_wrench(xi, path))))
     return jnp.stack(columns, axis=1) if columns else jnp.zeros((q.size, 0), q.dtype)
 
 

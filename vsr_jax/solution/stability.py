@@ -22,7 +22,7 @@ from ..elements.chords import chords_of
 from ..elements.driven_threads import driven_of, thread_length
 from ..elements.problem import loading
 from ..mechanics.arm_balance import ArmUnknown, imbalance_of, state_of
-from ..mechanics.balance import tangent, thread_direction, thread_wrench
+from ..mechanics.balance import tangent, unit_wrench
 from ..mechanics.coupling import ArmProblem, Constraint
 from ..mechanics.reaction import rotations
 from ..models.base import Nodes
@@ -217,7 +217,7 @@ def _unit_wrench(scene: Scene, xi: Vector, nodes: Nodes, place: int) -> Vector:
         rotation = rotations(stacked.stack(xi[:3]), nodes.grid.h, scene.rod.frame)[1]
         return chords_of(scene, xi, nodes.grid).unit(place, rotation)
     path = nodes.sections.paths[place]
-    wrench = thread_wrench(thread_direction(xi, path)[0], path)
+    wrench = unit_wrench(xi, path)
     return c.times(nodes.sections.reach[place], wrench)
 
 
