@@ -280,16 +280,21 @@ def _held(structure: Structure, random: np.random.Generator, slender: float) -> 
 
 
 def limp(structure: Structure, random: np.random.Generator) -> Numbers:
-    """A hanging rope with a weight from 10 to 1e5 EI / L^3 and a small force across its tip."""
+    """A hanging rope with a weight from 10 to 1e5 EI / L^3 and a small force across its tip. It is
+    so slender that the weight stretches it by a tenth at most: beyond, the linear law of the
+    sections means nothing."""
     numbers = {name: np.asarray(value) for name, value in ordinary(structure, random).items()}
-    length, radius = numbers["length"], numbers["radius"]
-    unit = numbers["young"] * np.pi * radius**4 / 4 / length**3
-    weight = 10 ** random.uniform(1, 5) * unit
+    length, load = numbers["length"], 10 ** random.uniform(1, 5)
+    stoutest = max(10.0, (load / 0.8) ** 0.5)
+    radius = length / np.exp(random.uniform(np.log(stoutest), np.log(3000)))
+    weight = load * numbers["young"] * np.pi * radius**4 / 4 / length**3
     across = np.array([0.0, *random.normal(size=2)])
     return plain(
         numbers
         | {
+            "radius": radius,
             "tip_radius": radius,
+            "guide_radius": radius,
             "curvature": np.zeros(2),
             "gravity": np.array([weight / (DENSITY * np.pi * radius**2), 0, 0]),
             "tip world force": 1e-3 * weight * length * across,

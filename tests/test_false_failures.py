@@ -70,6 +70,17 @@ def test_the_independent_tangent_is_that_of_differences(name):
 
 
 @pytest.mark.slow
+def test_the_last_strain_of_a_failed_solve_is_no_collapse():
+    """It is refused with a reversed section, and has a stable shape bent by 4.7 rad."""
+    name = "dead wrenches, three tendons"
+    numbers = draws(name, 76)[75]
+    assert Arm(STRUCTURES[name], numbers).follow().arrived
+    scene, inputs = built(STRUCTURES[name], numbers)
+    eq = vsr.solve(scene, inputs, model=vsr.StrainDependent(16))
+    assert eq.status in (vsr.Status.NOT_CONVERGED, vsr.Status.CONVERGED)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["catheter", "tip wrench and gravity"])
 def test_ordinary_scenes_are_not_refused(name):
     record = search(name, 40, seed=2)

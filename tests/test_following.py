@@ -274,3 +274,29 @@ def test_a_base_that_turns_leaves_the_friction_of_its_way():
     at_tip = -jax.vmap(lambda eq: eq.nodes.tau(eq.sound_forces)[0][-1, -1])(path)
     assert np.all(np.diff(at_tip[:3]) > 1e-3)
     np.testing.assert_allclose(at_tip[2:], at_tip[2], rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_gradients_by_a_path_of_scenes():
+    """Where nothing remembers the past, each sample is one solve."""
+    t, weight = jnp.linspace(0.0, 1.0, 3), jnp.array([[1.0, 2, 3], [2, -1, 1], [0.5, 3, 2]])
+    rod = vsr.Rod(0.3, vsr.Circular(0.005), vsr.Material(1e7, poisson=0.3, density=1000.0))
+
+    def scene_of(t, way):
+        end = jnp.stack([0.27 - 0.02 * t * way, 0.02 * way, 0.01 + 0 * t])
+        return vsr.Scene(rod, loads=vsr.Gravity(), held=vsr.Held(position=end))
+
+    def one(t, way):
+        return vsr.solve(scene_of(t, way), [], model=vsr.StrainDependent(4)).pose(0.15)[:3, 3]
+
+    def followed(way):
+        scenes = jax.vmap(lambda t: scene_of(t, way))(t)
+        path = vsr.follow(scenes, jnp.zeros((3, 0)), model=vsr.StrainDependent(4))
+        return jnp.sum(weight * jax.vmap(lambda eq: eq.pose(0.15)[:3, 3])(path))
+
+    alone = jax.jit(lambda way: jnp.sum(weight * jax.vmap(lambda t: one(t, way))(t)))
+    np.testing.assert_allclose(followed(1.0), alone(1.0), rtol=1e-9)
+    step = 1e-4
+    difference = (alone(1 + step) - alone(1 - step)) / (2 * step)
+    np.testing.assert_allclose(jax.grad(followed)(1.0), difference, rtol=1e-7)
+    np.testing.assert_allclose(jax.jvp(followed, (1.0,), (1.0,))[1], difference, rtol=1e-7)

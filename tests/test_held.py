@@ -213,6 +213,17 @@ def test_a_taut_wire_bears_its_stretch(name):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("steps", [8, 48])
+@pytest.mark.parametrize("stretch", [1e-5, 1e-4, 1e-3])
+def test_the_margin_of_a_taut_wire_is_that_of_its_shear(stretch, steps):
+    r"""Where it shears by $\gamma$ under its tension N, N turns by $\gamma / (1 + \epsilon)$: the
+    least eigenvalue is $1 - N / (GA (1 + \epsilon))$. Beside it lies a band of others."""
+    end = vsr.Held(position=(1 + stretch, 0, 0))
+    eq = vsr.solve(vsr.Scene(wire(), held=end), [], model=vsr.StrainDependent(steps))
+    np.testing.assert_allclose(eq.stability, 1 - 2.5 * stretch / (1 + stretch), atol=2e-6)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("aside", [5e-5, 5e-4])
 def test_a_wire_held_aside_in_its_middle(aside):
     r"""Each half is a beam of length l between clamps, under a tension N that its own deflection w

@@ -15,9 +15,9 @@ from ..numerics.batching import (
     TOGETHER,
     Iteration,
     arms_in,
-    at_once,
     iterated,
     known,
+    lanes,
     queued,
     side_by_side,
 )
@@ -42,13 +42,25 @@ from ..numerics.stacked import components, stack, total
 from ..typing import Shape, cast
 from .arm_balance import ArmImbalance, ArmUnknown, imbalance_of, rounding_of, state_of
 from .arm_tangent import approximate_solve, followed, tangent_solve
-from .balance import completed, residual, strain_norm, with_locked, without_force
+from .balance import (
+    completed,
+    residual,
+    shortened,
+    strain_norm,
+    with_locked,
+    without_force,
+)
 from .coupling import ArmProblem, ArmState, clear_of, forces_at
 from .sizes import shape_of, shape_size
 
-_LANES, _QUEUED = 48, 1024
-"""Arms with constraints that are solved at a time on a CPU, and those that wait in one queue, at
-most: some need four times as many steps as most."""
+_QUEUED = 1024
+"""Arms that wait in one queue on a CPU, at most."""
+_EVEN, _UNEVEN = TOGETHER, 48
+"""Arms that are solved side by side on a CPU, at most: where all of them need about as many steps,
+and where some need four times as many as most."""
+_SLOW = 1 / 8
+"""Share of even arms that may keep the next ones from beginning: an arm that fails takes ten times
+as many steps as most."""
 
 _BOW = 0.05
 """Angle [rad] by which an arm with constraints is bent and twisted at rest until these are exact,
@@ -86,8 +98,7 @@ def solve_arm(
             yes = jnp.array(True)
             found = guess._replace(xi=free_components(guess.xi, free))
             return Root(found, yes, yes, jnp.array(0, jnp.int32))
-        together = _QUEUED if _uneven(problem) else TOGETHER
-        root = side_by_side(partial(_solve, free), together)(_start(problem, free), guess, problem)
+        root = side_by_side(partial(_solve, free), _QUEUED)(_start(problem, free), guess, problem)
         point = root.x._replace(xi=free_components(root.x.xi, free))
         return root._replace(x=point, restarted=None if guess is None else root.restarted)
 
@@ -262,9 +273,10 @@ def _solve(
 ) -> Root:
     arms = arms_in((origin, guess, whole), whole.grid.h.ndim - 1)
     given = whole, origin, guess, jnp.broadcast_to(rounding_of(whole), arms)
-    lanes = at_once(_LANES)
-    if _uneven(whole) and arms and known(arms[0]) and arms[0] > lanes:
-        root = queued(partial(_iteration, free, (lanes,)), given, arms[0], lanes)
+    side = lanes(arms[0], _UNEVEN if _uneven(whole) else _EVEN) if arms else 0
+    if arms and known(arms[0]) and side < arms[0]:
+        slow = side - 1 if _uneven(whole) else int(_SLOW * side)
+        root = queued(partial(_iteration, free, (side,)), given, arms[0], side, slow)
     else:
         root = iterated(_iteration(free, arms, given))
     root = root._replace(x=_unknown(root.x, whole, free))
@@ -316,7 +328,12 @@ def _iteration(
         merit = sizes.of_imbalance(imbalance, at)
         clear = clear_of(at, problem)
         wrench = c.single(imbalance.wrench)
-        return Damped(point, size, wrench, merit, definite, doubtful, clear, slides)
+        out = None
+        if not whole.couplings:
+            # Under given forces an arm does not come back from there. One that lengths drive may:
+            # two of 339 random ones are solved on such a way (benchmarks/false_failures.py).
+            out = jnp.any(shortened(unknown.xi, whole.sections_of_threads), axis=(0, 1))
+        return Damped(point, size, wrench, merit, definite, doubtful, clear, slides, out)
 
     dot = sizes.dot if whole.follows_rate or whole.constrained else None
     return damped_newton(

@@ -34,7 +34,7 @@ from jaxtyping import Array
 
 from ..arm.routing import Path, thread_tangent
 from ..arm.scene import CrossSections
-from ..numerics.batching import in_parts
+from ..numerics.batching import TOGETHER, in_parts
 from ..numerics.component import (
     Forces,
     Matrix,
@@ -59,10 +59,6 @@ from ..numerics.newton import Evaluation, Root, newton
 
 _LOOPED = 3
 """Threads from which on the program loops over them: two are faster side by side."""
-
-_TOGETHER = 1024
-"""Arms without loads that are solved together on a CPU, at most; larger batches do not fit its
-caches."""
 
 ALL = tuple(range(6))
 """Indices of all strains."""
@@ -155,6 +151,22 @@ def _thread_stiffness(xi: Vector, path: Path, force: Array) -> Matrix:
     bending = [tuple(dwd[i][: i + 1]) for i in range(3)]
     linear = [(*(dw[j][i] for j in range(3)), *w[i][: i + 1]) for i in range(3)]
     return (*bending, *linear)
+
+
+def shortened(xi: Vector, sections: CrossSections, share: float = 0.0) -> Array:
+    """Whether the axis, or a thread's path between its ends, has at most a share of its length at
+    rest: 0 where it is reversed."""
+    short = xi[3] <= share * sections.rest[3]
+    if not sections.paths:
+        return short
+    path, reach = sections.every_path, sections.every_reach
+    rest = thread_tangent(sections.rest, path)
+    square = dot(rest, rest)
+    left = dot(thread_tangent(xi, path), rest) <= share * square
+    # a path without length at rest has the direction of its rounding errors
+    left = left & (square > (8 * jnp.finfo(square.dtype).eps) ** 2)
+    left = left if reach is None else left & (reach > 0)
+    return short | (left if len(sections.paths) == 1 else jnp.any(left, axis=0))
 
 
 def force_scale(stiffness: Vector) -> Array:
@@ -272,7 +284,7 @@ def solve_balance(
         return free_components(sections.rest, free), sections, without_force(tau), *others
 
     root = implicit_root(
-        in_parts(partial(_find_balance, free), _TOGETHER),
+        in_parts(partial(_find_balance, free), TOGETHER),
         imbalance,
         linear_solve,
         at_rest,

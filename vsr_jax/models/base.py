@@ -12,12 +12,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..arm.discs import shared_discs
-from ..arm.routing import Path, thread_tangent
 from ..arm.scene import CrossSections, Scene, shared, together
 from ..elements.problem import loading, problem_of
 from ..mechanics.applied_load import Loading
 from ..mechanics.arm_balance import ArmUnknown
-from ..mechanics.balance import thread_direction, thread_wrench
+from ..mechanics.balance import shortened, thread_direction, thread_wrench
 from ..mechanics.coupling import ArmProblem
 from ..mechanics.resolution import COARSE, step_error
 from ..numerics.component import Forces, Vector, dot, times
@@ -388,19 +387,14 @@ def classify(
     With tendons alone (not `loaded`) the energy is convex. A node that cannot be balanced then has
     its minimum of energy at a kink of the energy, where the path of a thread has length zero: it is
     collapsed. So is a node where a path or the axis is shortened to less than 1e-4 of its rest
-    length or is reversed. Under loads a node that cannot be balanced is collapsed if one thread
-    alone would shorten its path to zero.
+    length or is reversed. Under loads the strain of an arm that cannot be balanced says nothing: it
+    is collapsed if one thread alone would shorten its path to zero, by the force that it is given.
     """
-    collapsed = jnp.any(xi[3] <= _NOTHING * sections.rest[3])
+    collapsed = jnp.any(shortened(xi, sections, _NOTHING))
+    if loaded:
+        collapsed = collapsed & jnp.all(balanced)
     if sections.paths:
-        path, reach = sections.every_path, sections.every_reach
-        rest = thread_tangent(sections.rest, path)
-        square = dot(rest, rest)
-        left = dot(thread_tangent(xi, path), rest) <= _NOTHING * square
-        # a path without length at rest has the direction of its rounding errors
-        left = left & (square > (8 * jnp.finfo(square.dtype).eps) ** 2)
-        collapsed = collapsed | jnp.any(left if reach is None else left & (reach > 0))
-        pulling = _exhausted(tau, path, sections) if loaded else jnp.all(together(tau) <= 0)
+        pulling = _exhausted(tau, sections) if loaded else jnp.all(together(tau) <= 0)
         collapsed = collapsed | jnp.any(~balanced & pulling)
     finite = jnp.all(jnp.isfinite(sum(xi)))
     status = jnp.where(jnp.all(balanced), Status.CONVERGED, Status.NOT_CONVERGED)
@@ -410,9 +404,10 @@ def classify(
     return jnp.where(finite, status, Status.NOT_FINITE).astype(jnp.int32)
 
 
-def _exhausted(tau: Forces, path: Path, sections: CrossSections) -> Array:
-    r"""Whether one of the threads, all in `path`, would shorten its path to zero alone,
-    extrapolated from the rest state: $T w^T \Sigma^{-1} w \ge |t_c|$."""
+def _exhausted(tau: Forces, sections: CrossSections) -> Array:
+    r"""Whether one of the threads would shorten its path to zero alone, extrapolated from the rest
+    state: $T w^T \Sigma^{-1} w \ge |t_c|$."""
+    path = sections.every_path
     t, length = thread_direction(sections.rest, path)
     w = thread_wrench(t, path)
     strain = tuple(x / s for x, s in zip(w, sections.stiffness, strict=True))

@@ -142,8 +142,9 @@ class StrainDependent(SteppedModel):
         unknown, balanced, definite, steps, loose, restarted = found
         problem = problem.loosened(loose)
         forces, shares = carried_from_start(unknown, problem)
-        tau, sections = problem.along_sections(shared(forces, shares)), problem.sections_of_threads
-        status = classify(unknown.xi, sections, tau, balanced, definite, loaded=scene.reacts)
+        given = problem.along_sections(shared(problem.forces, shares))
+        sections = problem.sections_of_threads
+        status = classify(unknown.xi, sections, given, balanced, definite, loaded=scene.reacts)
         sound = status == Status.CONVERGED
         xi = rest_where_failed(status, unknown.xi, problem.sections)
         coupled = jax.tree.map(lambda x: jnp.where(sound, x, 0.0), unknown.coupled)

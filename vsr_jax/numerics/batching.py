@@ -48,8 +48,7 @@ def side_by_side(solve: Callable, together: int = TOGETHER) -> Callable:
 
     @batched_solve.def_vmap
     def _(size: Size, batched: list, *arguments: Any) -> tuple[Any, Any]:
-        rows = _rows(size, together)
-        rows += 8 if known(size) and rows % _ALIASED == 0 else 0
+        rows = lanes(size, together)
 
         def solved(arguments: tuple) -> Any:
             every = jax.tree.map(
@@ -65,6 +64,13 @@ def side_by_side(solve: Callable, together: int = TOGETHER) -> Callable:
         return _by_parts(solved, arguments, batched, size, rows)
 
     return batched_solve
+
+
+def lanes(size: Size, together: int) -> Size:
+    """Number of arms side by side, each in one place of the last axis: equal parts of a batch, of
+    at most `together` on a CPU (see `at_once`)."""
+    rows = _rows(size, together)
+    return rows + 8 if known(size) and rows % _ALIASED == 0 else rows
 
 
 def at_once(on_a_cpu: int) -> int:
@@ -179,12 +185,15 @@ def iterated(iteration: Iteration) -> Any:
     return iteration.result(end)
 
 
-def queued(iteration: Callable[[Any], Iteration], data: Any, problems: int, lanes: int) -> Any:
-    """As `iterated`, with as many problems at a time as there are `lanes`: where one is done, the
-    next one begins, so that none waits for the slowest.
+def queued(
+    iteration: Callable[[Any], Iteration], data: Any, problems: int, lanes: int, slow: int
+) -> Any:
+    """As `iterated`, with as many problems at a time as there are `lanes`: where they are done, the
+    next ones begin, so that few wait for the slowest.
 
     **Arguments:** `iteration`: that of the problems with some data; `data`: arrays whose last axis
-    is that of all problems, or of size 1.
+    is that of all problems, or of size 1; `slow`: the next problems begin once at most so many are
+    not done, since each beginning takes the time of a step or so.
     """
 
     def chosen(place: Array) -> Any:
@@ -193,9 +202,12 @@ def queued(iteration: Callable[[Any], Iteration], data: Any, problems: int, lane
     def advance(queue: _Queue) -> _Queue:
         current = iteration(queue.data)
         state = current.advance(queue.state)
-        done = (queue.place < problems) & ~current.busy(state)
+        begun, busy = queue.place < problems, current.busy(state)
+        done = begun & ~busy
+        left = jnp.sum(begun & busy)
+        refill = left <= jnp.where(queue.waiting < problems, slow, 0)
         queue, _ = alike(queue._replace(state=state), data)  # both branches return one type
-        return lax.cond(jnp.any(done), refilled, lambda queue, _: queue, queue, done)
+        return lax.cond(refill & jnp.any(done), refilled, lambda queue, _: queue, queue, done)
 
     def refilled(queue: _Queue, done: Array) -> _Queue:
         found = iteration(queue.data).result(queue.state)

@@ -165,6 +165,8 @@ def _direct_fails(state: State, trial: Trial, verdict: Verdict) -> Array:
     not double near the solution, they take 6 % more.
     """
     stopped = ~(verdict.accepted & trial.new.definite)
+    if trial.new.out is not None:
+        stopped = stopped | trial.new.out
     failed = jnp.where(trial.solving, stopped, probe.unstable(state.probe))
     if verdict.sliding is None:
         return failed

@@ -13,7 +13,8 @@ class Damped(NamedTuple):
     **Fields:** the step to subtract and its norm; the residual and its norm, the merit; whether the
     damped tangent is positive definite, and whether that is doubtful, since the tangent is far from
     symmetric; with constraints, whether they hold by a wide margin; with friction, whether
-    something slides, so that there is no energy.
+    something slides, so that there is no energy; whether the point is `out` of what the problem is
+    stated for, so that nothing follows from it.
     """
 
     step: Any
@@ -24,6 +25,7 @@ class Damped(NamedTuple):
     doubtful: Array
     clear: Array | None = None
     slides: Array | None = None
+    out: Array | None = None
 
 
 class Measures(NamedTuple):

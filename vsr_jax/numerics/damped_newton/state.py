@@ -12,7 +12,7 @@ class Local(NamedTuple):
     """What is known at the current point. Changed by `termination`.
 
     **Fields:** norm of the step proposed there; norm of the residual; estimated `error`, the sum of
-    all steps to come; `definite`, `doubtful` and `clear` as in `Damped`.
+    all steps to come; `definite`, `doubtful`, `clear` and `out` as in `Damped`.
     """
 
     step_norm: Array
@@ -21,6 +21,7 @@ class Local(NamedTuple):
     definite: Array
     doubtful: Array
     clear: Array
+    out: Array
 
 
 class Control(NamedTuple):

@@ -23,7 +23,7 @@ without an evaluation after it: what it leaves is then known from the contractio
 def begin(like: Array) -> Local:
     """Nothing is known before the first evaluation."""
     zero, no = jnp.zeros_like(like), jnp.zeros(like.shape, bool)
-    return Local(zero, zero + jnp.inf, zero, definite=~no, doubtful=no, clear=no)
+    return Local(zero, zero + jnp.inf, zero, definite=~no, doubtful=no, clear=no, out=no)
 
 
 def takes_plain_steps(state: State, schedule: Schedule) -> Array:
@@ -54,7 +54,7 @@ def solving(state: State, setting: Setting) -> Array:
     done = control.ready & (control.damping == 0) & accepted & negligible
     stuck = ~local.definite & (local.residual_norm < tolerance.rounding)
     ended = (done | stuck) & (state.path.level == setting.schedule.last)
-    return ~ended & (state.plain < _MAX_PLAIN)
+    return ~ended & ~local.out & (state.plain < _MAX_PLAIN)
 
 
 def converged(state: State, setting: Setting) -> Array:
@@ -77,7 +77,7 @@ def local(
     Without last steps, catheters take 12 %, arms driven by lengths 11 % and arms of all slenderness
     under tip forces 10 % more evaluations.
     """
-    new, clear = trial.new, trial.new.clear
+    new, clear, out = trial.new, trial.new.clear, trial.new.out
     rate = jnp.maximum(jnp.maximum(found.steps, state.convergence.rate), found.residuals)
     rate = jnp.clip(rate, 0.0, 1.0)
     residual_norm, error = rate * new.merit, rate / (1 - rate) * new.size
@@ -91,4 +91,5 @@ def local(
         definite=new.definite,
         doubtful=new.doubtful,
         clear=state.local.clear if clear is None else clear,
+        out=state.local.out if out is None else out,
     )
