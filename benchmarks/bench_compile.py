@@ -57,6 +57,11 @@ def scenes() -> dict[str, tuple[vsr.Scene, Any]]:
     rubbing = [
         vsr.Tendon(vsr.Parallel(y, z), friction=0.1) for y, z in ((4e-3, 0.0), (-2e-3, 4e-3))
     ]
+    one, end = jnp.array([1.0]), (0.18, 0.0, 0.02)
+
+    def pulled(**beside: Any) -> tuple[vsr.Scene, Any]:
+        return vsr.Scene(rubber, vsr.Tendon(vsr.Parallel(4e-3, 0.0)), vsr.Gravity(), **beside), one
+
     return {
         "B1": (paper.scene("B1"), jnp.array([-10.0])),
         "steel rod": (
@@ -65,6 +70,9 @@ def scenes() -> dict[str, tuple[vsr.Scene, Any]]:
         ),
         "catheter": (vsr.Scene(nitinol, tendons, tip), jnp.arange(8.0)),
         "friction": (vsr.Scene(rubber, rubbing, vsr.Gravity()), jnp.array([1.0, 2.0])),
+        "contact": pulled(obstacles=vsr.Sphere((0.15, 0.0, -0.05), 0.03)),
+        "pinned": pulled(held=vsr.Held(position=end)),
+        "clamped": pulled(held=vsr.Held(position=end, orientation=np.eye(3))),
     }
 
 

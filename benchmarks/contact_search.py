@@ -2,17 +2,21 @@
 
     python benchmarks/contact_search.py [--draws 1000] [--obstacles 1 3 10] [--json FILE]
     python benchmarks/contact_search.py --tubes 100 [--steps 24] [--json FILE]
+    python benchmarks/contact_search.py --paths 200 [--steps 24] [--json FILE]
 
 The first form: arms with gravity, a force at the tip and some spheres that do not touch the arm at
 rest. The second: arms in straight tubes, in tubes bent in space, and in such tubes of varying
 width, as many of each. The arm fills 0.3 to 0.8 of the width; it starts in the middle of the tube,
-along it, and has a force at the tip, gravity in any direction or two tendons.
+along it, and has a force at the tip, gravity in any direction or two tendons. The third: stout arms
+that a tendon bends onto a cylinder across their way, where the contact slides along the arm, at 21
+tensions each, every one solved from rest.
 
 All arms of a kind are solved in batches. Printed: how many have a solution that was found, the
 deepest penetration anywhere on the outline (from the positions of the solution, not from the
 solver's gaps), the largest `min(gap, force)`, and the imbalance of forces: the reaction at the base
 against the sum of all loads and contact forces. In tubes also the arms that are not solved, by
-load.
+load. Of paths, how many samples are refused, and of them those between two solved ones with nearly
+the same tip, where the shape between them exists.
 """
 
 import argparse
@@ -37,6 +41,9 @@ LOADS = ("force", "gravity", "tendons")
 BEND, PIECES = 1.6, 5
 """Angle [rad] by which the line of a bent tube turns at most, in each of two directions, and the
 number of pieces between its points."""
+SAMPLES, NEAR = 21, 0.2
+"""Tensions of a path, and the distance of two tips, as a share of the length, below which the
+samples belong to one branch."""
 
 
 def drawn(rng: np.random.Generator, count: int) -> dict[str, Any]:
@@ -77,6 +84,33 @@ def drawn_tube(rng: np.random.Generator, kind: str) -> dict[str, Any]:
     }
 
 
+def drawn_path(rng: np.random.Generator) -> dict[str, Any]:
+    """Numbers of one stout arm, its largest tension, and a cylinder across the way of a point of
+    the arm, on the inner side, beside the straight arm."""
+    radius = LENGTH / rng.uniform(7, 40)
+    place, bend = 0.6 * radius, rng.uniform(1.0, 2.5)
+    turn, X = bend * rng.uniform(0.3, 0.8), LENGTH * rng.uniform(0.5, 1.0)
+    at, heading = turn * X / LENGTH, LENGTH / turn
+    point = heading * np.array([np.sin(at), 1 - np.cos(at), 0.0])
+    inner, wide = np.array([-np.sin(at), np.cos(at), 0.0]), rng.uniform(0.3, 3.0) * radius
+    axis = np.array([*rng.uniform(-1, 1, 2), 1.0])
+    centre = point + inner * (wide + radius)
+    across = np.cross(axis, np.array([1.0, 0.0, 0.0]))
+    if abs(centre @ across) / np.linalg.norm(across) < 1.05 * (wide + radius):
+        return drawn_path(rng)  # the straight arm touches it
+    bending = YOUNG * np.pi * radius**4 / 4
+    down = rng.normal(size=3)
+    return {
+        "radius": radius,
+        "place": place,
+        "tension": bend * bending / (place * LENGTH),
+        "centre": centre,
+        "axis": axis / np.linalg.norm(axis),
+        "wide": wide,
+        "weight": down / np.linalg.norm(down) * rng.uniform(0, 1) * bending / LENGTH**3,
+    }
+
+
 def among_spheres(count: int, numbers: dict[str, jax.Array]) -> tuple[vsr.Scene, jax.Array]:
     """Scene and inputs of one arm among spheres."""
     obstacles = [vsr.Sphere(numbers["centres"][i], numbers["radii"][i]) for i in range(count)]
@@ -94,6 +128,18 @@ def in_tube(numbers: dict[str, jax.Array]) -> tuple[vsr.Scene, jax.Array]:
     tendons = [vsr.Tendon(vsr.Parallel(y, z)) for y, z in ((0.003, 0.0), (0.0, 0.003))]
     rod = _rod(numbers["density"], vsr.pose(line[0], pointing=ahead))
     return vsr.Scene(rod, tendons, loads, obstacles=tube), numbers["tensions"]
+
+
+def onto_cylinder(numbers: dict[str, jax.Array], share: jax.Array) -> tuple[vsr.Scene, jax.Array]:
+    """Scene and inputs of one arm at a share of its largest tension."""
+    material = vsr.Material(young=YOUNG, poisson=0.4)
+    rod = vsr.Rod(length=LENGTH, section=vsr.Circular(numbers["radius"]), material=material)
+    tendon = vsr.Tendon(vsr.Parallel(numbers["place"], 0.0))
+    weight = vsr.DistributedWrench(force=numbers["weight"])
+    along = vsr.pose(numbers["centre"], pointing=numbers["axis"])
+    cylinder = vsr.Cylinder(numbers["wide"], pose=along)
+    scene = vsr.Scene(rod, tendon, weight, obstacles=cylinder)
+    return scene, share[None] * numbers["tension"]
 
 
 def _rod(density: jax.Array, base: jax.Array | None = None) -> vsr.Rod:
@@ -176,6 +222,42 @@ def tubes(arms: int, steps: int) -> dict[str, Any]:
     return record
 
 
+def paths(arms: int, steps: int) -> dict[str, Any]:
+    """The record of arms that are bent onto a cylinder."""
+    rng, begin = np.random.default_rng(0), time.perf_counter()
+    draws = [drawn_path(rng) for _ in range(arms)]
+
+    def sample(numbers: dict[str, jax.Array], share: jax.Array) -> tuple[jax.Array, ...]:
+        eq = vsr.solve(*onto_cylinder(numbers, share), model=vsr.StrainDependent(steps))
+        return eq.status, eq.tip[:3, 3], jnp.sum(eq.contacts.force > 1e-6 * numbers["tension"])
+
+    every = jax.vmap(jax.vmap(sample, (None, 0)), (0, None))
+    numbers = jax.tree.map(lambda *x: np.stack(x), *draws)
+    found = jax.jit(every)(numbers, jnp.linspace(0.0, 1.0, SAMPLES))
+    status, tip, touching = map(np.asarray, found)
+    good = status == 0
+    refused = [(arm, i) for arm in range(arms) for i in range(SAMPLES) if not good[arm, i]]
+    between = []
+    for arm, i in refused:
+        before, after = np.flatnonzero(good[arm, :i]), i + 1 + np.flatnonzero(good[arm, i + 1 :])
+        if before.size and after.size:
+            moved = np.linalg.norm(tip[arm, after[0]] - tip[arm, before[-1]])
+            if moved < NEAR * LENGTH:
+                between.append((arm, i))
+    record = {
+        "paths": arms,
+        "samples": int(good.size),
+        "solved": int(np.sum(good)),
+        "statuses": statuses(status.reshape(-1)),
+        "touching": int(np.sum(good & (touching > 0))),
+        "refused between solved ones": len(between),
+        "which": between,
+        "seconds": time.perf_counter() - begin,
+    }
+    print("paths", json.dumps(record), flush=True)
+    return record
+
+
 def spheres(arms: int, counts: list[int], steps: int) -> dict[int, Any]:
     """The records of arms among spheres, for each number of them."""
     record = {}
@@ -196,11 +278,14 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=1000)
     parser.add_argument("--obstacles", type=int, nargs="+", default=[1, 3, 10])
     parser.add_argument("--tubes", type=int, help="arms in each kind of tube, in place of spheres")
+    parser.add_argument("--paths", type=int, help="arms bent onto a cylinder, in place of spheres")
     parser.add_argument("--steps", type=int, default=24, help="steps of the grid along the arm")
     parser.add_argument("--json")
     options = parser.parse_args()
     if options.tubes:
         record = tubes(options.tubes, options.steps)
+    elif options.paths:
+        record = paths(options.paths, options.steps)
     else:
         record = spheres(options.draws, options.obstacles, options.steps)
     if options.json:

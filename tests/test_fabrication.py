@@ -57,6 +57,28 @@ def test_drilling_plan_and_lengths():
     assert "thinnest: the wall" in str(made)
 
 
+def two_sections():
+    """Three cables to the middle through ten discs, and three to the tip that share these and have
+    others beyond."""
+    rod = vsr.Rod(0.2, vsr.Circular(5e-4), SOFT, guide_radius=0.009)
+    ways = [(8e-3 * np.cos(a), 8e-3 * np.sin(a)) for a in np.arange(6) * np.pi / 3]
+    inner = [vsr.Tendon(vsr.Parallel(*way), discs=10, end=0.1) for way in ways[::2]]
+    places = [*np.arange(1, 11) * 0.01, 0.12, 0.16, 0.19]
+    return vsr.Scene(
+        rod, [*inner, *(vsr.Tendon(vsr.Parallel(*w), disc_places=places) for w in ways[1::2])]
+    )
+
+
+@pytest.mark.slow
+def test_the_discs_of_the_tendons_are_drilled():
+    made = vsr.export(two_sections())
+    every = dict.fromkeys(made.holes.column("X [mm]"))
+    expected = [*np.arange(11) * 10.0, 120, 160, 190, 200]
+    np.testing.assert_allclose(list(every), expected, atol=1e-4)
+    threads = [row[2] for row in made.holes.rows if row[0] == 11]
+    assert threads == [3, 4, 5]  # beyond the others
+
+
 def crossing(start=0.002):
     """Two threads that approach each other towards the tip, on an arm whose wall approaches
     one."""

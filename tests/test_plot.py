@@ -144,6 +144,15 @@ def test_rigid_pieces_have_a_wall_of_their_own():
 
 
 @pytest.mark.slow
+def test_discs_are_drawn_where_the_tendons_have_them():
+    rod = vsr.Rod(0.3, vsr.Circular(1e-3), vsr.Material(2e9, poisson=0.3), guide_radius=0.01)
+    tendon = vsr.Tendon(vsr.Parallel(0.008, 0.0), disc_places=[0.05, 0.11, 0.2])
+    eq = vsr.solve(vsr.Scene(rod, tendon), [0.1])
+    middle = body_of(eq).discs[:, :-1].mean(axis=1)
+    np.testing.assert_allclose(middle, eq.position([0.0, 0.05, 0.11, 0.2, 0.3]), atol=1e-6)
+
+
+@pytest.mark.slow
 def test_discs_are_drawn_and_a_thin_arm_is_widened():
     thread = [vsr.Tendon(vsr.Parallel(0.0005, 0.0))]
     for guide, widened in ((None, True), (0.01, False)):

@@ -17,6 +17,9 @@ from .actuator import Actuator
 from .rod import Rod
 from .routing import thread_tangent
 
+_SAME = 1e-6
+"""Distance of two abscissas, as a share of the length, below which they are one disc."""
+
 
 def _own_discs(
     rod: Rod, actuators: Sequence[Actuator]
@@ -39,6 +42,25 @@ def inner_discs(rod: Rod, actuators: Sequence[Actuator]) -> Iterator[Scalar]:
     discs on the whole arm that several tendons share come once."""
     for _, holes, places in _own_discs(rod, actuators):
         yield from (holes[i] for i in places)
+
+
+def disc_places(rod: Rod, actuators: Sequence[Actuator]) -> list[Scalar]:
+    """Abscissas [m] of all discs of straight tendons, with those at their ends; none without such
+    tendons. Those that several tendons name by abscissas come several times."""
+    straight = [actuator for actuator in actuators if actuator.straight]
+    places = list(inner_discs(rod, straight))
+    if any(actuator.start is None for actuator in straight):
+        places.append(jnp.zeros_like(rod.length))
+    if any(actuator.end is None for actuator in straight):
+        places.append(rod.length)
+    given = (x for actuator in straight for x in (actuator.start, actuator.end))
+    return [*places, *(x for x in given if x is not None)]
+
+
+def distinct_discs(rod: Rod, actuators: Sequence[Actuator]) -> Float[np.ndarray, " discs"]:
+    """`disc_places` of known numbers, ascending, each once."""
+    X = np.sort(np.array(disc_places(rod, actuators), float))
+    return X[np.append(np.diff(X) > _SAME * float(rod.length), True)] if X.size else X
 
 
 def shared_discs(rod: Rod, actuators: Sequence[Actuator]) -> int:

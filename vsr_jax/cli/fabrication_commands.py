@@ -63,7 +63,7 @@ def add_export(commands: Commands) -> None:
         metavar="X",
         nargs="+",
         type=float,
-        help="abscissas in metres of the discs to drill (default: 11, evenly spaced)",
+        help="abscissas in metres of the discs to drill (default: those of the tendons, or 11)",
     )
     parser.add_argument(
         "--chord",
@@ -75,7 +75,7 @@ def add_export(commands: Commands) -> None:
 
 
 def _export(options: argparse.Namespace) -> int:
-    from ..fabrication.exporting import DISCS, fabrication_of
+    from ..fabrication.exporting import fabrication_of
 
     files = {name: getattr(options, name) for name in _FILES}
     check_folders(*files.values())
@@ -101,7 +101,7 @@ def _export(options: argparse.Namespace) -> int:
         arm,
         bore=options.bore[0] if options.bore and len(options.bore) == 1 else options.bore,
         wall=options.wall,
-        discs=DISCS if options.discs is None else options.discs,
+        discs=options.discs,
         tolerance=options.chord,
     )
     made.write(**files)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..arm.discs import distinct_discs
 from ..arm.scene import Scene
 from ..numerics.compiling import program
 from ..numerics.component import norm
@@ -34,8 +35,8 @@ LEAST_WALL = 4e-4
 TOLERANCE = 2e-5
 """Default distance [m] of chords from the shape."""
 
-DISCS = 11
-"""Default number of discs of the drilling plan."""
+_DISCS = 11
+"""Number of discs of the drilling plan where tendons have none."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,7 @@ def export(
     lengths: PathLike | None = None,
     bore: ArrayLike | None = None,
     wall: float = LEAST_WALL,
-    discs: VectorLike = DISCS,
+    discs: VectorLike | None = None,
     tolerance: float = TOLERANCE,
 ) -> Fabrication:
     r"""Writes files for the workshop, in millimetres.
@@ -147,7 +148,8 @@ def export(
       distance of the thread from a wall or half the least distance of two threads.
     - `wall`: thickness [m] of walls below which there is a warning. Walls are measured in the
       exported shape.
-    - `discs`: number of discs, evenly spaced from base to tip, or their abscissas [m].
+    - `discs`: number of discs, evenly spaced from base to tip, or their abscissas [m]; by default
+      those of the straight tendons and their ends, or 11 even ones where there are none.
     - `tolerance`: distance [m] of chords from the shape; sets the number of stations and of corners
       around.
 
@@ -170,7 +172,7 @@ def fabrication_of(
     *,
     bore: ArrayLike | None = None,
     wall: float = LEAST_WALL,
-    discs: VectorLike = DISCS,
+    discs: VectorLike | None = None,
     tolerance: float = TOLERANCE,
 ) -> Fabrication:
     """`export` without files; warnings are in the result only."""
@@ -226,8 +228,11 @@ def _given_bores(scene: Scene, bore: ArrayLike | None) -> Float[np.ndarray, " th
     )
 
 
-def _places(scene: Scene, discs: VectorLike) -> Float[np.ndarray, " discs"]:
+def _places(scene: Scene, discs: VectorLike | None) -> Float[np.ndarray, " discs"]:
     length = float(scene.rod.length)
+    if discs is None:
+        X = distinct_discs(scene.rod, scene.actuators)
+        return X if X.size else np.linspace(0.0, length, _DISCS)
     if isinstance(discs, int | np.integer):
         return np.linspace(0.0, length, count("discs", discs, least=2))
     X = np.asarray(numbers("discs", discs, None), float)

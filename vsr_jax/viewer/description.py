@@ -22,7 +22,7 @@ from ..numerics.compiling import program
 from ..solution.equilibrium import Equilibrium
 from ..solution.summary import Summary
 from ..viz.annotate import Acting, Row, rows_from_wrenches, wrenches_of
-from ..viz.body import Body, body_from_samples, with_rigid_ends
+from ..viz.body import Body, body_from_samples, with_parts
 
 STATIONS = 61
 
@@ -63,7 +63,7 @@ def shape_of(eq: Equilibrium) -> Shape:
 
 @program("view")
 def _described(eq: Equilibrium) -> tuple[Summary, Array, Array, list[Acting]]:
-    X = with_rigid_ends(eq.scene.rod, jnp.linspace(0, 1, STATIONS) * eq.scene.rod.length)
+    X = with_parts(eq.scene, jnp.linspace(0, 1, STATIONS) * eq.scene.rod.length)
     samples = eq.summary(X, ("forces", "stability"))
     return samples, *wall_state(eq.scene.rod, samples), wrenches_of(eq)
 
