@@ -58,9 +58,9 @@ _QUEUED = 1024
 _EVEN, _UNEVEN = TOGETHER, 48
 """Arms that are solved side by side on a CPU, at most: where all of them need about as many steps,
 and where some need four times as many as most."""
-_SLOW = 8
-"""Even arms that may go on beside the next ones, in as many places more: one that fails takes ten
-times as many steps as most."""
+_SLOW = 1 / 8
+"""Share of even arms that may go on beside the next ones: one that fails takes ten times as many
+steps as most."""
 
 _BOW = 0.05
 """Angle [rad] by which an arm with constraints is bent and twisted at rest until these are exact,
@@ -275,8 +275,7 @@ def _solve(
     given = whole, origin, guess, jnp.broadcast_to(rounding_of(whole), arms)
     side = lanes(arms[0], _UNEVEN if _uneven(whole) else _EVEN) if arms else 0
     if arms and known(arms[0]) and side < arms[0]:
-        slow = side - 1 if _uneven(whole) else _SLOW
-        side = side if _uneven(whole) else side + _SLOW
+        slow = side - 1 if _uneven(whole) else int(_SLOW * side)
         root = queued(partial(_iteration, free, (side,)), given, arms[0], side, slow)
     else:
         root = iterated(_iteration(free, arms, given))

@@ -153,9 +153,10 @@ def _discs(eq: Equilibrium, samples: Summary) -> np.ndarray:
     if radius is None:
         return np.zeros((0, len(_ANGLES), 3))
     places = distinct_discs(rod, eq.scene.actuators)
-    if not places.size:
-        places = np.linspace(samples.X[0], samples.X[-1], _DISCS)
-    chosen = np.unique(np.argmin(np.abs(samples.X - places[:, None]), axis=1))
+    if places.size:
+        chosen = np.unique(np.argmin(np.abs(samples.X - places[:, None]), axis=1))
+    else:
+        chosen = np.unique(np.linspace(0, len(samples.X) - 1, _DISCS).astype(int))
     pose = np.asarray(samples.pose)[chosen]
     rim = float(radius) * np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])
     return pose[:, None, :3, 3] + np.einsum("dij,ja->dai", pose[:, :3, 1:3], rim)
