@@ -4,7 +4,7 @@ are pulled with far more than they bear.
     python benchmarks/bench_collapse.py [--json FILE] [--rounds N]
 
 One arm with three tendons, without loads, under its weight and with a force across its tip; all
-batches of a scene are the same compiled program, timed in turn in one run.
+batches of a scene run the same program, timed in turn in one run.
 """
 
 import argparse

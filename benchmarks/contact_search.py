@@ -132,8 +132,7 @@ def in_tube(numbers: dict[str, jax.Array]) -> tuple[vsr.Scene, jax.Array]:
 
 def onto_cylinder(numbers: dict[str, jax.Array], share: jax.Array) -> tuple[vsr.Scene, jax.Array]:
     """Scene and inputs of one arm at a share of its largest tension."""
-    material = vsr.Material(young=YOUNG, poisson=0.4)
-    rod = vsr.Rod(length=LENGTH, section=vsr.Circular(numbers["radius"]), material=material)
+    rod = _rod(jnp.zeros(()), radius=numbers["radius"])
     tendon = vsr.Tendon(vsr.Parallel(numbers["place"], 0.0))
     weight = vsr.DistributedWrench(force=numbers["weight"])
     along = vsr.pose(numbers["centre"], pointing=numbers["axis"])
@@ -142,9 +141,11 @@ def onto_cylinder(numbers: dict[str, jax.Array], share: jax.Array) -> tuple[vsr.
     return scene, share[None] * numbers["tension"]
 
 
-def _rod(density: jax.Array, base: jax.Array | None = None) -> vsr.Rod:
+def _rod(
+    density: jax.Array, base: jax.Array | None = None, radius: jax.Array | float = RADIUS
+) -> vsr.Rod:
     material = vsr.Material(young=YOUNG, poisson=0.4, density=density)
-    return vsr.Rod(length=LENGTH, section=vsr.Circular(radius=RADIUS), material=material, base=base)
+    return vsr.Rod(length=LENGTH, section=vsr.Circular(radius=radius), material=material, base=base)
 
 
 def solved(scene_of: Callable, steps: int, numbers: dict[str, jax.Array]) -> dict[str, jax.Array]:

@@ -42,22 +42,15 @@ from ..numerics.stacked import components, stack, total
 from ..typing import Shape, cast
 from .arm_balance import ArmImbalance, ArmUnknown, imbalance_of, rounding_of, state_of
 from .arm_tangent import approximate_solve, followed, tangent_solve
-from .balance import (
-    completed,
-    residual,
-    shortened,
-    strain_norm,
-    with_locked,
-    without_force,
-)
+from .balance import completed, residual, shortened, strain_norm, with_locked, without_force
 from .coupling import ArmProblem, ArmState, clear_of, forces_at
 from .sizes import shape_of, shape_size
 
 _QUEUED = 1024
 """Arms that wait in one queue on a CPU, at most."""
-_EVEN, _UNEVEN = TOGETHER, 48
-"""Arms that are solved side by side on a CPU, at most: where all of them need about as many steps,
-and where some need four times as many as most."""
+_UNEVEN = 48
+"""Arms that are solved side by side on a CPU, at most, where some need four times as many steps as
+most; others by `TOGETHER`."""
 _SLOW = 1 / 8
 """Share of even arms that may go on beside the next ones: one that fails takes ten times as many
 steps as most."""
@@ -273,7 +266,7 @@ def _solve(
 ) -> Root:
     arms = arms_in((origin, guess, whole), whole.grid.h.ndim - 1)
     given = whole, origin, guess, jnp.broadcast_to(rounding_of(whole), arms)
-    side = lanes(arms[0], _UNEVEN if _uneven(whole) else _EVEN) if arms else 0
+    side = lanes(arms[0], _UNEVEN if _uneven(whole) else TOGETHER) if arms else 0
     if arms and known(arms[0]) and side < arms[0]:
         slow = side - 1 if _uneven(whole) else int(_SLOW * side)
         root = queued(partial(_iteration, free, (side,)), given, arms[0], side, slow)

@@ -84,11 +84,11 @@ def extreme_pairs(operator: Operator) -> Pairs:
 
     Residuals reach $\epsilon^{0.6}$ for the smallest eigenvalue and $\epsilon^{0.4}$ for the
     largest, relative where the eigenvalue is above 1 in size. At the edge of a band of close
-    eigenvalues the residual of the smallest falls slowly: it is NaN where that stays above
-    $\epsilon^{0.5}$ and $\epsilon^{0.25}$ of its size. Derivatives are exact, of any order:
-    $d\lambda = v^T dS\, v$ and $(S - \lambda)\, dv = -(dS - d\lambda) v$ by conjugate gradients. A
-    multiple eigenvalue has no derivative; the result is the derivative along one of its
-    eigenvectors.
+    eigenvalues residuals fall slowly: an eigenvalue is NaN where its own stays above
+    $\epsilon^{0.5}$, of the largest $\epsilon^{0.4}$, and $\epsilon^{0.25}$ of its size.
+    Derivatives are exact, of any order: $d\lambda = v^T dS\, v$ and
+    $(S - \lambda)\, dv = -(dS - d\lambda) v$ by conjugate gradients. A multiple eigenvalue has no
+    derivative; the result is the derivative along one of its eigenvectors.
     """
     product = operator.product()
     start = np.random.default_rng(0).standard_normal(operator.like.shape)
