@@ -29,7 +29,7 @@ jax.config.update("jax_enable_x64", True)
 
 CATHETER = """
 wire = vsr.Rod(0.3, vsr.Circular(0.0007), vsr.Material(54e9, poisson=0.3, density=6450.0),
-               guide_radius=0.0101)
+               discs=vsr.Discs(10, radius=0.0101))
 around = np.pi / 4 * np.arange(8)
 tendons = [vsr.Tendon(vsr.Parallel(0.01 * np.cos(a), 0.01 * np.sin(a))) for a in around]
 scene = vsr.Scene(wire, tendons, [vsr.Gravity(), vsr.TipWrench(force=(0.0, 0.05, 0.0))])
@@ -74,9 +74,10 @@ inputs = jnp.asarray(inputs)
     + SOLVED,
     "disc robot": """
 wire = vsr.Rod(0.2, vsr.Circular(0.0005), vsr.Material(54e9, poisson=0.3, density=6450.0),
-               guide_radius=0.009)
+               discs=vsr.Discs(10, radius=0.009))
 around = 2 * np.pi / 3 * np.arange(3)
-tendons = [vsr.Tendon(vsr.Parallel(0.008 * np.cos(a), 0.008 * np.sin(a)), discs=10) for a in around]
+holes = [vsr.Parallel(0.008 * np.cos(a), 0.008 * np.sin(a)) for a in around]
+tendons = [vsr.Tendon(hole, straight=True) for hole in holes]
 scene, inputs = vsr.Scene(wire, tendons, [vsr.Gravity()]), jnp.array([2.0, 0.0, 0.5])
 """
     + SOLVED,

@@ -37,7 +37,7 @@ def catheter() -> vsr.Scene:
         0.4,
         vsr.Circular(0.0007),
         vsr.Material(54e9, poisson=0.3, density=6450),
-        guide_radius=0.0101,
+        discs=vsr.Discs(10, radius=0.0101),
     )
     places = [(0.01, 0.0), (0.0, 0.01), (-0.01, 0.0), (0.0, -0.01)]
     tendons = [vsr.Tendon(vsr.Parallel(y, z), end=end) for end in (0.2, None) for y, z in places]

@@ -31,7 +31,10 @@ LINE, REACH = 0.285, 0.05
 def arm(*heights: float) -> vsr.Scene:
     """A nitinol wire with threads in its plane, initially at constant heights [m]."""
     wire = vsr.Rod(
-        LENGTH, vsr.Circular(0.0007), vsr.Material(54e9, poisson=0.3), guide_radius=0.0101
+        LENGTH,
+        vsr.Circular(0.0007),
+        vsr.Material(54e9, poisson=0.3),
+        discs=vsr.Discs(10, radius=0.0101),
     )
     X = np.linspace(0, LENGTH, KNOTS)
     return vsr.Scene(

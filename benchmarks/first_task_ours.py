@@ -14,7 +14,7 @@ wire = vsr.Rod(
     length=0.3,
     section=vsr.Circular(radius=0.0007),
     material=vsr.Material(young=54e9, poisson=0.3, density=6450.0),
-    guide_radius=0.0101,
+    discs=vsr.Discs(10, radius=0.0101),
 )
 places = [(0.0, 0.010), (0.00866, -0.005), (-0.00866, -0.005)]
 tendons = [vsr.Tendon(vsr.Parallel(y, z)) for y, z in places]

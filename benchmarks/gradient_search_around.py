@@ -96,7 +96,8 @@ def drawn(effects: frozenset[str], random: np.random.Generator) -> check.Drawn |
     if "discs" in effects:
         at, aside = random.uniform(0, 2 * np.pi), random.uniform(0.4, 0.9) * radius
         path = vsr.Parallel(aside * np.cos(at), aside * np.sin(at))
-        actuators.append(vsr.Tendon(path, discs=4))
+        rod = eqx.tree_at(lambda rod: rod.discs, rod, vsr.Discs(4), is_leaf=lambda x: x is None)
+        actuators.append(vsr.Tendon(path, straight=True))
         inputs = jnp.append(inputs, tendons.pull(arm, random))
     loads = [*scene.loads, *pose_loads(effects, arm, random)]
     free: dict[str, Any] = {} if plain.free is None else {"free_strains": plain.free}

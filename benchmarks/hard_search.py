@@ -103,7 +103,7 @@ def built(draw: Draw) -> tuple[vsr.Scene, np.ndarray]:
         vsr.Circular(vsr.Taper(radius, draw.tip * radius)),
         material,
         rest_strain=rest,
-        guide_radius=2 * radius,
+        discs=vsr.Discs(10, radius=2 * radius),
     )
     threads = [
         vsr.Thread(vsr.Helix(place * radius, pitch=L / turns, phase=phase))

@@ -68,7 +68,7 @@ def tentacle(moduli: int = 2) -> vsr.Scene:
             density=1500.0,
         ),
         base=hanging,
-        guide_radius=0.0125,
+        discs=vsr.Discs(10, radius=0.0125),
     )
     tendons = [
         vsr.Tendon(

@@ -58,7 +58,7 @@ def arm(stiffness: np.ndarray) -> vsr.Scene:
         vsr.Circular(0.0005),
         vsr.Material(5e10, poisson=0.3),
         base=upright,
-        guide_radius=0.006,
+        discs=vsr.Discs(10, radius=0.006),
     )
     tendons = [
         vsr.Tendon(

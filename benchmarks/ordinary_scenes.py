@@ -23,7 +23,7 @@ import vsr_jax as vsr
 
 Numbers = dict[str, Any]
 DENSITY = 1000.0
-DISCS = 5
+DISCS = 6
 PARALLEL = 1e-9
 """Turns of a helix that stands for a parallel path."""
 MOST_WEIGHT, MOST_FORCE, MOST_MOMENT = 30.0, 10.0, 5.0
@@ -67,8 +67,9 @@ def built(structure: Structure, numbers: Numbers, share: Any = 1.0) -> tuple[vsr
     section = vsr.Circular(vsr.Taper(n["radius"], n["tip_radius"]))
     material = vsr.Material(n["young"], poisson=n["poisson"], density=DENSITY)
     rest = (0.0, n["curvature"][0], n["curvature"][1], 1.0, 0.0, 0.0)
-    rod = vsr.Rod(n["length"], section, material, rest_strain=rest, guide_radius=n["guide_radius"])
-    tendons, even = [], n["length"] * jnp.arange(1, DISCS + 1) / (DISCS + 1)
+    discs = vsr.Discs(DISCS, radius=n["rim"])
+    rod = vsr.Rod(n["length"], section, material, rest_strain=rest, discs=discs)
+    tendons = []
     for i, laid in enumerate(structure.tendons):
         path = vsr.Helix(n["place"][i], pitch=n["length"] / n["turns"][i], phase=n["phase"][i])
         if laid.control == "pressure":
@@ -82,7 +83,7 @@ def built(structure: Structure, numbers: Numbers, share: Any = 1.0) -> tuple[vsr
                 stiffness=n["stiffness"][i] if laid.elastic else None,
                 friction=n["friction"][i] if laid.motion else None,
                 motion=laid.motion or "pull",
-                disc_places=even if structure.discs else None,
+                straight=structure.discs,
             )
         )
     around: dict[str, Any] = {}
@@ -123,7 +124,7 @@ def ordinary(structure: Structure, random: np.random.Generator) -> Numbers:
         "tip_radius": taper * radius,
         "young": young,
         "poisson": random.uniform(0.2, 0.49),
-        "guide_radius": radius * random.uniform(1.0, 2.0),
+        "rim": radius * random.uniform(1.0, 2.0),
         "curvature": random.uniform(-2, 2, 2) / length * (random.random() < 0.5),
         "gravity": _direction(random)
         * MOST_WEIGHT
@@ -153,7 +154,7 @@ def _tendons(structure: Structure, random: np.random.Generator, numbers: Numbers
     )
     if not count:
         return {}
-    place = numbers["guide_radius"] * random.uniform(0.2, 0.9, count)
+    place = numbers["rim"] * random.uniform(0.2, 0.9, count)
     phase = (
         random.uniform(0, 2 * np.pi)
         + 2 * np.pi * np.arange(count) / count
@@ -199,7 +200,7 @@ def catheter(structure: Structure, random: np.random.Generator) -> Numbers:
             "tip_radius": 5e-4,
             "young": 60e9,
             "poisson": 0.3,
-            "guide_radius": 5e-4,
+            "rim": 5e-4,
             "curvature": np.zeros(2),
             "place": np.full(4, 4.5e-4),
             "phase": np.arange(4) * np.pi / 2,
@@ -222,7 +223,7 @@ def upright(structure: Structure, random: np.random.Generator) -> Numbers:
             "tip_radius": 0.004,
             "young": 10 ** random.uniform(5.5, 6.2),
             "poisson": 0.45,
-            "guide_radius": 0.010,
+            "rim": 0.010,
             "curvature": np.zeros(2),
             "gravity": gravity,
             "place": np.full(1, 0.003),
@@ -269,7 +270,7 @@ def _held(structure: Structure, random: np.random.Generator, slender: float) -> 
     numbers |= {
         "radius": radius,
         "tip_radius": radius,
-        "guide_radius": radius,
+        "rim": radius,
         "curvature": np.zeros(2),
         "gravity": weight / (DENSITY * np.pi * radius**2),
     }
@@ -294,7 +295,7 @@ def limp(structure: Structure, random: np.random.Generator) -> Numbers:
         | {
             "radius": radius,
             "tip_radius": radius,
-            "guide_radius": radius,
+            "rim": radius,
             "curvature": np.zeros(2),
             "gravity": np.array([weight / (DENSITY * np.pi * radius**2), 0, 0]),
             "tip world force": 1e-3 * weight * length * across,
@@ -308,7 +309,7 @@ def antagonistic(structure: Structure, random: np.random.Generator) -> Numbers:
     the arm under a common tension, up to half of what buckles the arm."""
     numbers = {name: np.asarray(value) for name, value in ordinary(structure, random).items()}
     count, length, radius = len(structure.tendons), numbers["length"], numbers["radius"]
-    young, place = numbers["young"], np.full(count, 0.9 * numbers["guide_radius"])
+    young, place = numbers["young"], np.full(count, 0.9 * numbers["rim"])
     axial, bending = young * np.pi * radius**2, young * np.pi * radius**4 / 4
     phase = 2 * np.pi * np.arange(count) / count
     angle, plane = 2.5 * random.random(), random.uniform(0, 2 * np.pi)

@@ -7,9 +7,12 @@ $m$ and the force $n$ act,
 $$R' = R \hat\kappa, \quad p' = R \upsilon, \quad
 \Sigma (\kappa, \upsilon - e_x) = R^T (m - p \times n, \ n).$$
 
-At a disc a tendon of tension T pulls its hole along both chords, at its last disc along one, and
-the wrenches at the start of all pieces are those for which forces and moments balance at all discs:
-found by Newton's method, with differences of the residual.
+At a disc a tendon of tension T pulls its hole along both chords, at its last disc along one. With
+friction its tension changes from chord to chord by the factor $e^{\mp \mu \varphi}$ of a pulley,
+with the angle $\varphi$ between the chords; along a path a chord keeps the tension that it had
+between the least and the most that this allows. The wrenches at the start of all pieces are those
+for which forces and moments balance at all discs: found by Newton's method, with differences of the
+residual.
 
 The published code of Rao, Peyron, Lilge and Burgner-Kahrs 2021 (its model of rods between discs,
 https://github.com/SvenLilge/tdcr-modeling) solves this system but for one term, which `axial`
@@ -32,7 +35,10 @@ MOST_ITERATIONS, BALANCED, DIFFERENCE = 40, 1e-10, 1e-6
 class Robot(NamedTuple):
     """Lengths of the pieces, at whose ends the discs are; stiffness (torsion, bending, bending,
     elongation, shear, shear); holes (tendons, 2), the number of the last disc of each tendon, and
-    its tension; force at the tip in the world frame. The arm lies along x."""
+    its tension; force at the tip in the world frame. The arm lies along x.
+
+    `friction`: coefficient of the holes, positive for pull and negative for release; `before`:
+    tensions (tendons, pieces) that the chords had, if the arm follows a path."""
 
     lengths: np.ndarray
     stiffness: np.ndarray
@@ -40,6 +46,8 @@ class Robot(NamedTuple):
     last: np.ndarray
     tension: np.ndarray
     force: np.ndarray
+    friction: float = 0.0
+    before: np.ndarray | None = None
 
     @property
     def units(self) -> np.ndarray:
@@ -63,11 +71,46 @@ def solve(robot: Robot, *, axial: bool) -> np.ndarray:
 
     **Raises:** `RuntimeError` if Newton's method does not converge.
     """
+    return discs(robot, _balance(robot, axial)).position
+
+
+def _balance(robot: Robot, axial: bool) -> np.ndarray:
+    """The wrenches at the starts of all pieces, without units."""
     x = np.zeros(6 * len(robot.lengths))
     for share in SHARES:
         part = robot._replace(tension=share * robot.tension, force=share * robot.force)
         x = _newton(part, x, axial)
-    return discs(robot, x).position
+    return x
+
+
+class Sample(NamedTuple):
+    """Positions (discs, 3) of the base and all discs, and tensions and lengths of the chords, both
+    (tendons, pieces), 0 beyond the ends of tendons."""
+
+    position: np.ndarray
+    tension: np.ndarray
+    length: np.ndarray
+
+
+def follow(robot: Robot, path: np.ndarray) -> list[Sample]:
+    """The robot with friction in its holes along a path of tensions, from rest.
+
+    **Raises:** `RuntimeError` as `solve`.
+    """
+    shape = len(robot.holes), len(robot.lengths)
+    x, before, found = np.zeros(6 * shape[1]), np.zeros(shape), []
+    for tension in path:
+        now = robot._replace(tension=tension, before=before)
+        x = _newton(now, x, True)
+        at = discs(now, x)
+        tension, length = np.zeros(shape), np.zeros(shape)
+        for i in range(shape[0]):
+            chord, pull = _chords(now, i, at)
+            length[i, : robot.last[i]] = np.linalg.norm(chord, axis=-1)
+            tension[i, : robot.last[i]] = np.linalg.norm(pull, axis=-1)
+        before = tension
+        found.append(Sample(at.position, tension, length))
+    return found
 
 
 def _newton(robot: Robot, x: np.ndarray, axial: bool) -> np.ndarray:
@@ -132,14 +175,12 @@ def _pieces(robot: Robot, wrench: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def residual(robot: Robot, x: np.ndarray, axial: bool) -> np.ndarray:
     """Moments and forces (..., 6 pieces) that are missing at the discs, without units."""
     at = discs(robot, x)
-    R, p = at.rotation, at.position
+    R = at.rotation
     tip = np.broadcast_to([0, 0, 0, *robot.force], at.start[..., :1, :].shape)
     missing = at.end - np.concatenate([at.start[..., 1:, :], tip], -2)
-    for hole, last, tension in zip(robot.holes, robot.last, robot.tension, strict=True):
+    for i, (hole, last) in enumerate(zip(robot.holes, robot.last, strict=True)):
         arm = _apply(R, np.array([0.0, *hole]))
-        chord = np.diff(p + arm, axis=-2)[..., :last, :]
-        pull = tension * chord / np.linalg.norm(chord, axis=-1, keepdims=True)
-        on = -pull
+        on = -(pull := _chords(robot, i, at)[1])
         on[..., :-1, :] += pull[..., 1:, :]
         if not axial:
             axis = R[..., 1:last, :, 0]
@@ -147,6 +188,23 @@ def residual(robot: Robot, x: np.ndarray, axial: bool) -> np.ndarray:
         moment = np.cross(arm[..., 1 : last + 1, :], on)
         missing[..., :last, :] -= np.concatenate([moment, on], -1)
     return (missing / robot.units).reshape(x.shape)
+
+
+def _chords(robot: Robot, i: int, at: Discs) -> tuple[np.ndarray, np.ndarray]:
+    """Chords of a tendon (..., chords, 3) and the pull along each."""
+    last = robot.last[i]
+    holes = at.position + _apply(at.rotation, np.array([0.0, *robot.holes[i]]))
+    chord = np.diff(holes, axis=-2)[..., :last, :]
+    e = chord / np.linalg.norm(chord, axis=-1, keepdims=True)
+    cosine = np.clip(np.sum(e[..., 1:, :] * e[..., :-1, :], axis=-1), -1.0, 1.0)
+    sine = np.linalg.norm(np.cross(e[..., 1:, :], e[..., :-1, :]), axis=-1)
+    turned = np.cumsum(np.arctan2(sine, cosine), axis=-1)
+    turned = np.concatenate([np.zeros((*turned.shape[:-1], 1)), turned], axis=-1)
+    tension = robot.tension[i] * np.exp(-robot.friction * turned)
+    if robot.before is not None:
+        most = robot.tension[i] * np.exp(robot.friction * turned)
+        tension = np.clip(robot.before[i, :last], tension, most)
+    return chord, tension[..., None] * e
 
 
 def _apply(R: np.ndarray, x: np.ndarray) -> np.ndarray:

@@ -67,19 +67,21 @@ CASES = {
 }
 
 
-def wire(length: float) -> vsr.Rod:
-    """The backbone of one section or of both."""
+def wire(length: float, discs: int | None) -> vsr.Rod:
+    """The backbone of one section or of both, through whose discs tendons run straight,
+    or as the section does for None."""
     material = vsr.Material(YOUNG, poisson=POISSON)
-    return vsr.Rod(length, vsr.Circular(RADIUS), material, guide_radius=1.01 * OFFSET)
+    guides = vsr.Discs(discs or 10, radius=1.01 * OFFSET)
+    return vsr.Rod(length, vsr.Circular(RADIUS), material, discs=guides)
 
 
 def shapes(discs: int | None) -> dict[str, np.ndarray]:
     """Positions [m] along the arm of every case, shape (stations, 3); NaN where there is no stable
     equilibrium."""
     X, model = jnp.linspace(0, LENGTH, 41), vsr.StrainDependent(max(24, discs or 0))
-    rod, found = wire(LENGTH), {}
+    rod, found = wire(LENGTH, discs), {}
     for name, case in CASES.items():
-        scene = vsr.Scene(rod, [vsr.Tendon(case.routing, discs=discs)], case.loads)
+        scene = vsr.Scene(rod, [vsr.Tendon(case.routing, straight=discs is not None)], case.loads)
         found[name] = np.asarray(vsr.solve(scene, [case.tension], model=model).position(X))
     return found
 
@@ -108,10 +110,10 @@ HOLES = OFFSET * np.array([[np.cos(angle), np.sin(angle)] for angle in 2 * _PLAC
 def robot(discs: int | None) -> vsr.Scene:
     """The robot with its discs, or with tendons along the section; the force is to be put in."""
     tendons = [
-        vsr.Tendon(vsr.Parallel(*hole), end=sections * LENGTH, discs=discs and sections * discs)
+        vsr.Tendon(vsr.Parallel(*hole), end=sections * LENGTH, straight=discs is not None)
         for hole, sections in zip(HOLES, SECTIONS, strict=True)
     ]
-    return vsr.Scene(wire(2 * LENGTH), tendons, [vsr.TipWrench()])
+    return vsr.Scene(wire(2 * LENGTH, discs and 2 * discs), tendons, [vsr.TipWrench()])
 
 
 def rods(discs: int, inputs: Inputs) -> independent.Robot:

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vsr_jax.chain import Border, Chain, Coupled, bordered_solve, with_spans
+from vsr_jax.chain import Border, Chain, Coupled, Spans, bordered_solve
 from vsr_jax.numerics.component import cholesky
 from vsr_jax.numerics.quadrature import beyond, make_grid
 
@@ -18,19 +18,33 @@ KINDS = {
     "dead forces, in a plane": {"free": PLANE},
     "dead forces and a rigid piece": {"rigid": True},
     "loads that turn": {"motion": 3},
-    "loads that turn on an arm that can be cut": {"motion": 3, "cut": True},
     "springs along the arm": {"motion": 6},
     "springs, bending only": {"motion": 6, "free": BENDING},
     "springs in the cells": {"motion": 6, "cells": True},
     "springs in the cells and a rigid piece": {"motion": 6, "cells": True, "rigid": True},
+    "springs across spans": {"spans": True},
+    "springs across spans, bending only": {"spans": True, "free": BENDING},
+    "springs across spans, in the cells and a rigid piece": {
+        "spans": True,
+        "motion": 6,
+        "cells": True,
+        "rigid": True,
+    },
     "nothing is coupled": {"coupled": False},
     "stretch alone": {"free": STRETCH},
 }
+
+
+def by_motion(kind):
+    """Whether what acts on the chain depends on positions."""
+    return kind.get("motion") == 6 or kind.get("spans", False)
+
+
 WITH_POTENTIAL = [
     (name, pressed)
     for name in KINDS
     for pressed in (0.3, 2.0, 6.0)
-    if KINDS[name].get("motion") == 6 or (KINDS[name].get("motion") is None and pressed < 6.0)
+    if by_motion(KINDS[name]) or (KINDS[name].get("motion") is None and pressed < 6.0)
     if name != "nothing is coupled"
 ]
 """Those whose matrix is symmetric, but for errors of the quadrature, and forces that press them.
@@ -57,7 +71,7 @@ def by_steps(forces, axis, grid):
 
 
 def chain(
-    seed, *, free=EVERY, coupled=True, motion=0, cells=False, rigid=False, cut=False, pressed=1.0
+    seed, *, free=EVERY, coupled=True, motion=0, cells=False, rigid=False, spans=False, pressed=1.0
 ):
     """A chain of random sections under random dead forces of a size `pressed`, and springs where
     motions have the size 6: all of a potential, but for loads that turn."""
@@ -75,7 +89,7 @@ def chain(
     rotation = np.moveaxis(rotation, (2, 3), (0, 1))
     axis = np.eye(3)[0].reshape(3, 1, 1) + 0.2 * rng.standard_normal((3, *shape))
     forces = pressed * rng.standard_normal((3, *shape))
-    if motion == 6:
+    if motion == 6 or spans:
         wrenches = by_cells(forces, axis, np.broadcast_to(grid.weight, shape))
     else:
         wrenches = by_steps(forces, axis, grid)
@@ -94,9 +108,18 @@ def chain(
             springs(shape[1]) if motion else None,
             springs(*shape) if cells else None,
             jnp.asarray(rng.uniform(size=shape)) if cells else None,
-            jnp.asarray(np.arange(shape[1]) != 1, float) if cut else None,
+            across(rng, shape[1]) if spans else None,
         ),
         grid,
+    )
+
+
+def across(rng, steps):
+    """Four springs across each of two spans: the first of one step, the second of the others."""
+    a, b = rng.standard_normal((2, 6, 4, 2))
+    of_step = np.minimum(np.arange(steps), 1)
+    return Spans(
+        *(jnp.asarray(x) for x in (a[..., of_step], b[..., of_step], 1.0 * (np.arange(steps) < 2)))
     )
 
 
@@ -144,7 +167,7 @@ def test_the_solution_is_that_of_the_dense_matrix(name, apart):
 def test_the_pivots_count_the_negative_eigenvalues(name, apart, pressed):
     of = chain(2, **KINDS[name], pressed=pressed)
     dense = weights(of)[:, None] * np.asarray(of.to_dense())
-    if KINDS[name].get("motion") == 6:  # each row with the weight of its node
+    if by_motion(KINDS[name]):  # each row with the weight of its node
         np.testing.assert_allclose(dense, dense.T, atol=1e-13 * np.abs(dense).max())
     _, definiteness = of.solve(sides(of), apart=apart)
     values = np.linalg.eigvals(dense)
@@ -214,17 +237,23 @@ def test_a_nearly_rigid_spring_in_any_direction(name, apart):
     assert int(definiteness.negative) == 0
 
 
-@pytest.mark.parametrize("apart", [False, True])
-@pytest.mark.parametrize("name", ["dead forces", "springs along the arm"])
-def test_stiffness_across_spans(name, apart):
-    of = chain(7, **KINDS[name])
-    springs, b = sides(of, 4, seed=8), sides(of)
-    solve = lambda b: of.solve(b, apart=apart)  # noqa: E731
-    found, _ = with_spans(solve, springs, of.grid, True, apart=apart)(b)
-    w = rows(of, springs)
-    dense = np.asarray(of.to_dense()) + w.T @ (w * weights(of))
-    expected = np.linalg.solve(dense, rows(of, b).T).T
-    np.testing.assert_allclose(rows(of, found), expected, atol=1e-11 * np.abs(expected).max())
+def test_stiffness_across_spans():
+    """The dense matrix with springs across spans is that without them and the product of what
+    stretches the springs."""
+    of = chain(7, spans=True)
+    bare = of._replace(
+        coupled=of.coupled._replace(
+            spans=of.coupled.spans._replace(
+                start=0 * of.coupled.spans.start, end=0 * of.coupled.spans.end
+            )
+        )
+    )
+    w = weights(of)
+    more = w[:, None] * (np.asarray(of.to_dense()) - np.asarray(bare.to_dense()))
+    np.testing.assert_allclose(more, more.T, atol=1e-13 * np.abs(more).max())
+    values = np.linalg.eigvalsh(more)
+    assert np.sum(values > 1e-10 * values[-1]) == 8
+    assert values[0] > -1e-12 * values[-1]
 
 
 def test_a_border():

@@ -11,7 +11,7 @@ ARM = vsr.Rod(
     0.75,
     vsr.Circular(vsr.Taper(0.012, 0.01)),
     vsr.Material(5.93e5, shear=2e5, density=1080.0),
-    guide_radius=0.03,
+    discs=vsr.Discs(10, radius=0.03),
 )
 SCENE = vsr.Scene(
     ARM,
@@ -25,19 +25,19 @@ SCENE = vsr.Scene(
 )
 TABLE = """\
 Scene
-  rod.length        0.75 m
-  rod.section       Circular(radius=Taper(base=0.012 m, tip=0.01 m))
-  rod.material      Material(young=593000 Pa, shear=200000 Pa, density=1080 kg/m^3)
-  rod.guide_radius  0.03 m
-  actuators[0]      Tendon(routing=Helix(radius=0.005 m, pitch=0.8 m), end=0.4 m, friction=0.1),
-                      input in N
-  actuators[1]      Tendon(routing=Parallel(y=0 m, z=0.005 m), control='length', stiffness=20000 N),
-                      input in m
-  actuators[2]      Chamber(routing=Polynomial(y=(0.001 m, 0.01), z=(-0.004 m)), area=2e-5 m^2),
-                      input in Pa
-  loads[0]          Gravity(acceleration=(0, 0, -9.81) m/s^2)
-  loads[1]          TipWrench(force=(0, 0, 0.1) N, frame='body')
-  free_strains      bending_y, bending_z"""
+  rod.length    0.75 m
+  rod.section   Circular(radius=Taper(base=0.012 m, tip=0.01 m))
+  rod.material  Material(young=593000 Pa, shear=200000 Pa, density=1080 kg/m^3)
+  rod.discs     Discs(number=10, radius=0.03 m)
+  actuators[0]  Tendon(routing=Helix(radius=0.005 m, pitch=0.8 m), end=0.4 m, friction=0.1),
+                  input in N
+  actuators[1]  Tendon(routing=Parallel(y=0 m, z=0.005 m), control='length', stiffness=20000 N),
+                  input in m
+  actuators[2]  Chamber(routing=Polynomial(y=(0.001 m, 0.01), z=(-0.004 m)), area=2e-5 m^2),
+                  input in Pa
+  loads[0]      Gravity(acceleration=(0, 0, -9.81) m/s^2)
+  loads[1]      TipWrench(force=(0, 0, 0.1) N, frame='body')
+  free_strains  bending_y, bending_z"""
 
 
 def test_a_scene_is_a_table_of_numbers_with_units():
@@ -104,10 +104,10 @@ def test_traced_numbers_are_shown_as_such():
         return scene.rod.length
 
     program(SCENE)
-    assert "rod.length        traced\n" in texts[0]
+    assert "rod.length       traced\n" in texts[0]
     assert "acceleration=traced (3,)" in texts[0]
     assert "control='length'" in texts[0]
-    assert "rod.length        unknown\n" in repr(eqx.filter_eval_shape(lambda s: s, SCENE))
+    assert "rod.length       unknown\n" in repr(eqx.filter_eval_shape(lambda s: s, SCENE))
 
 
 def test_a_batch_shows_its_range():
@@ -115,7 +115,7 @@ def test_a_batch_shows_its_range():
         jnp.linspace(0.002, 0.006, 20)
     )
     assert "radius=20 numbers, from 0.002 to 0.006 m" in repr(batch)
-    assert "rod.length        20 numbers, each 0.75 m\n" in repr(batch)
+    assert "rod.length    20 numbers, each 0.75 m\n" in repr(batch)
     assert "acceleration=numbers of shape (20, 3), from -9.81 to 0 m/s^2" in repr(batch)
 
 

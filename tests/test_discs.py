@@ -13,15 +13,28 @@ from benchmarks import rods_between_discs, straight_tendons
 from vsr_jax.files.scene_file import parse_scene, to_toml
 
 LENGTH, RADIUS, YOUNG = 0.3, 0.01, 1e6
-ARM = vsr.Rod(LENGTH, vsr.Circular(RADIUS), vsr.Material(YOUNG, poisson=0.45, density=1000.0))
+MATERIAL = vsr.Material(YOUNG, poisson=0.45, density=1000.0)
 EI = YOUNG * np.pi / 4 * RADIUS**4
 STEPS, FINE = vsr.StrainDependent(12), vsr.StrainDependent(36)
 TENSIONS = jnp.array([3.0, 2.0])
 PATHS = vsr.Parallel(0.007, 0.0), vsr.Helix(0.007, pitch=0.4, phase=2.0)
 
 
-def scene(loads=(), **options):
-    return vsr.Scene(ARM, [vsr.Tendon(path, **options) for path in PATHS], loads)
+def arm(discs=None):
+    """A rod with discs."""
+    if isinstance(discs, int):
+        discs = vsr.Discs(discs)
+    elif discs is not None:
+        discs = vsr.Discs(places=discs)
+    return vsr.Rod(LENGTH, vsr.Circular(RADIUS), MATERIAL, discs=discs)
+
+
+def scene(loads=(), discs=None, **options):
+    """The arm with two tendons, straight ones if it has discs."""
+    straight = discs is not None
+    return vsr.Scene(
+        arm(discs), [vsr.Tendon(path, straight=straight, **options) for path in PATHS], loads
+    )
 
 
 @pytest.fixture(scope="module")
@@ -55,10 +68,9 @@ def planar_segment(tension, offset, length):
 @pytest.mark.slow
 @pytest.mark.parametrize(("discs", "tension"), [(1, 0.4), (3, 4.0)])
 def test_an_arm_in_a_plane_is_that_of_a_separate_integration(discs, tension):
-    arm = vsr.Scene(
-        ARM, [vsr.Tendon(vsr.Parallel(0.007, 0.0), discs=discs)], free_strains=["bending_z"]
-    )
-    eq = vsr.solve(arm, [tension], model=vsr.StrainDependent(24), throw=True)
+    tendon = vsr.Tendon(vsr.Parallel(0.007, 0.0), straight=True)
+    plane = vsr.Scene(arm(discs), [tendon], free_strains=["bending_z"])
+    eq = vsr.solve(plane, [tension], model=vsr.StrainDependent(24), throw=True)
     x, y, angle = planar_segment(tension, 0.007, LENGTH / discs)
     place, turned = np.zeros(2), 0.0
     for _ in range(discs):
@@ -72,12 +84,11 @@ def test_an_arm_in_a_plane_is_that_of_a_separate_integration(discs, tension):
 
 
 def test_a_robot_of_two_sections_is_that_of_rods_between_its_discs():
-    """Six tendons run through the same discs, so that nearly all pieces of the arm are empty."""
     discs, length = 3, 2 * straight_tendons.LENGTH
     places = jnp.linspace(0, length, 2 * discs + 1)
     for case in list(straight_tendons.ROBOT_CASES.values())[-2:]:
-        arm = straight_tendons.robot(discs).replace("loads[0].force", case.force)
-        found = vsr.solve(arm, case.tensions, throw=True).position(places)
+        robot = straight_tendons.robot(discs).replace("loads[0].force", case.force)
+        found = vsr.solve(robot, case.tensions, throw=True).position(places)
         expected = rods_between_discs.solve(straight_tendons.rods(discs, case), axial=True)
         np.testing.assert_allclose(found, expected, atol=2e-6 * length)
 
@@ -89,13 +100,14 @@ def test_a_central_tendon_buckles_the_arm_between_its_discs(discs):
     (\pi^2 EI)$. A tendon along the section never does."""
     critical = np.pi**2 * EI / (LENGTH / discs) ** 2
     names = ["bending_y", "bending_z"]
-    arm = vsr.Scene(ARM, [vsr.Tendon(vsr.Parallel(0.0, 0.0), discs=discs)], free_strains=names)
-    eq = vsr.solve(arm, [0.98 * critical], model=STEPS, throw=True)
+    tendon = vsr.Tendon(vsr.Parallel(0.0, 0.0), straight=True)
+    pressed = vsr.Scene(arm(discs), [tendon], free_strains=names)
+    eq = vsr.solve(pressed, [0.98 * critical], model=STEPS, throw=True)
     np.testing.assert_allclose(eq.stability, 0.02, atol=1e-5)
     np.testing.assert_allclose(eq.tip[:3, 3], [LENGTH, 0, 0], atol=1e-12)
-    beyond = vsr.solve(arm, [1.02 * critical], model=STEPS)
+    beyond = vsr.solve(pressed, [1.02 * critical], model=STEPS)
     assert beyond.status == vsr.Status.UNSTABLE
-    along = vsr.Scene(ARM, [vsr.Tendon(vsr.Parallel(0.0, 0.0))], free_strains=names)
+    along = vsr.Scene(arm(), [vsr.Tendon(vsr.Parallel(0.0, 0.0))], free_strains=names)
     assert vsr.solve(along, [1.02 * critical], model=STEPS).converged
 
 
@@ -134,13 +146,14 @@ def test_a_moment_at_the_tip_leaves_an_arm_with_discs_stable():
     """The pivots of its tangent without the turning of the chords miss pairs of its negative
     eigenvalues, since a moment has no potential."""
     moment = vsr.TipWrench(force=(0.0, 0.3 * EI / LENGTH**2, 0.0), moment=(0.4 * EI / LENGTH, 0, 0))
-    arm = vsr.Scene(ARM, [vsr.Tendon(vsr.Parallel(0.0, -0.007), discs=4)], [moment])
+    tendon = vsr.Tendon(vsr.Parallel(0.0, -0.007), straight=True)
+    turned = vsr.Scene(arm(4), [tendon], [moment])
     tensions = jnp.array([[1.0], [2.0]]) * 0.25 * EI / (LENGTH * 0.007)
 
     @jax.jit
     @jax.vmap
     def solved(tension):
-        eq = vsr.solve(arm, tension, model=STEPS)
+        eq = vsr.solve(turned, tension, model=STEPS)
         return eq.status, eq.stability
 
     status, margin = solved(tensions)
@@ -184,10 +197,9 @@ BACKBONE = vsr.Rod(
     0.245,
     vsr.Circular(0.002),
     vsr.Material(2.31e9, shear=849e6, density=742.7),
-    guide_radius=0.022,
+    discs=vsr.Discs(places=(0.07667, 0.08167, 0.15833, 0.16333, 0.24, 0.245), radius=0.022),
     base=vsr.pose(pointing="up"),
 )
-HOLES = (0.07667, 0.08167, 0.15833, 0.16333, 0.24)
 
 
 @pytest.mark.slow
@@ -198,7 +210,7 @@ def test_three_lengths_that_pull_against_each_other(share):
     angles = np.radians([0, 120, 240])
     paths = 0.021 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     tendons = [
-        vsr.Tendon(vsr.Parallel(y, z), control="length", stiffness=2474.0, disc_places=HOLES)
+        vsr.Tendon(vsr.Parallel(y, z), control="length", stiffness=2474.0, straight=True)
         for y, z in paths
     ]
     scene = vsr.Scene(BACKBONE, tendons, vsr.Gravity())
@@ -208,8 +220,7 @@ def test_three_lengths_that_pull_against_each_other(share):
     assert eq.stability > 0.2
     tensions = -np.asarray(eq.forces)
     assert np.all(tensions > 0.5)
-    ends = np.array([0.0, *HOLES, 0.245])
-    poses = np.asarray(eq.pose(ends))
+    poses = np.asarray(eq.pose(np.array([0.0, *BACKBONE.discs.places])))
     for (y, z), change, tension in zip(paths, changes, tensions, strict=True):
         holes = poses[:, :3, :3] @ [0, y, z] + poses[:, :3, 3]
         length = np.linalg.norm(np.diff(holes, axis=0), axis=1).sum()
@@ -240,11 +251,12 @@ PLACED = [0.08, 0.19]
 def coordinate(p):
     """A number of a loaded arm by five others: two tensions, two discs, the offset of a tendon."""
     tendons = [
-        vsr.Tendon(vsr.Parallel(p[4], 0.0), disc_places=p[2:4], end=0.25),
-        vsr.Tendon(PATHS[1], discs=3),
+        vsr.Tendon(vsr.Parallel(p[4], 0.0), end=0.25, straight=True),
+        vsr.Tendon(PATHS[1], straight=True),
     ]
+    rod = arm(jnp.concatenate([p[2:4], jnp.array([0.25, LENGTH])]))
     force = vsr.TipWrench(force=(0.0, 0.05, -0.1))
-    eq = vsr.solve(vsr.Scene(ARM, tendons, [force]), p[:2], model=vsr.StrainDependent(8))
+    eq = vsr.solve(vsr.Scene(rod, tendons, [force]), p[:2], model=vsr.StrainDependent(8))
     return eq.tip[:3, 3] @ jnp.array([1.0, -2.0, 3.0])
 
 
@@ -261,10 +273,10 @@ def test_gradients_in_both_modes_are_finite_differences():
 @pytest.mark.slow
 @pytest.mark.parametrize("loads", [(), (vsr.Gravity(),)])
 def test_a_batch_is_its_arms(loads):
-    arm = scene(loads, discs=3)
+    guided = scene(loads, discs=3)
 
     def tip(inputs):
-        return vsr.solve(arm, inputs, model=STEPS).tip[:3, 3]
+        return vsr.solve(guided, inputs, model=STEPS).tip[:3, 3]
 
     inputs = jnp.array([[3.0, 2.0], [0.0, 0.0], [1.0, 4.0]])
     np.testing.assert_allclose(
@@ -283,62 +295,84 @@ def test_precision_is_that_of_the_inputs(dtype):
 @pytest.mark.slow
 def test_places_of_even_discs_are_their_number():
     by_number = vsr.solve(scene(discs=3), TENSIONS, model=FINE, throw=True)
-    by_places = vsr.solve(scene(disc_places=[0.1, 0.2]), TENSIONS, model=FINE, throw=True)
+    by_places = vsr.solve(scene(discs=[0.1, 0.2, 0.3]), TENSIONS, model=FINE, throw=True)
     np.testing.assert_allclose(by_places.tip, by_number.tip, atol=1e-7)
     assert scene(discs=3).edges().size == 4  # shared by both tendons
-    none = vsr.solve(scene(disc_places=[]), TENSIONS / 10, model=STEPS, throw=True)
-    one = vsr.solve(scene(discs=1), TENSIONS / 10, model=STEPS, throw=True)
-    np.testing.assert_allclose(none.tip, one.tip, atol=1e-12)
 
 
 @pytest.mark.slow
 def test_a_slack_tendon_with_discs_does_nothing():
     straight = vsr.solve(scene([vsr.Gravity()], discs=3), [0.0, 0.0], model=STEPS, throw=True)
-    bare = vsr.solve(vsr.Scene(ARM, loads=[vsr.Gravity()]), [], model=STEPS, throw=True)
+    bare = vsr.solve(vsr.Scene(arm(), loads=[vsr.Gravity()]), [], model=STEPS, throw=True)
     np.testing.assert_allclose(straight.tip, bare.tip, atol=1e-8)
 
 
 def test_scene_files_keep_discs():
-    tendons = [vsr.Tendon(PATHS[0], discs=4), vsr.Tendon(PATHS[1], disc_places=PLACED)]
-    arm = vsr.Scene(ARM, tendons)
-    text = to_toml(arm)
-    assert "discs = 4" in text
-    read = parse_scene(text).scene
-    assert repr(read) == repr(arm)
-    assert read.effects == ("tendons", "sections", "discs")
-    even, placed = read.actuators
-    assert isinstance(even, vsr.Tendon)
-    assert isinstance(placed, vsr.Tendon)
-    assert even.discs == 4
-    np.testing.assert_array_equal(placed.disc_places, PLACED)
+    for discs in (vsr.Discs(4, radius=0.02), vsr.Discs(places=PLACED, mass=[1e-3, 2e-3])):
+        rod = vsr.Rod(LENGTH, vsr.Circular(RADIUS), MATERIAL, discs=discs)
+        robot = vsr.Scene(rod, [vsr.Tendon(PATHS[0], straight=True, end=discs.along(LENGTH)[0])])
+        text = to_toml(robot)
+        assert "straight = true" in text
+        read = parse_scene(text).scene
+        assert repr(read) == repr(robot)
+        assert read.effects == ("tendons", "sections", "straight tendons")
+        for name in ("places", "radius", "mass", "number"):
+            np.testing.assert_array_equal(getattr(read.rod.discs, name), getattr(discs, name))
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("arguments", "options", "message"),
     [
-        ({"discs": 0}, "Tendon.discs: got 0, need an integer >= 1"),
-        ({"discs": 2, "disc_places": [0.1]}, "need one of the two"),
-        ({"discs": 2, "friction": 0.1}, "Tendon.friction: got 0.1 with discs"),
-        ({"disc_places": 0.1}, r"Tendon.disc_places: got shape \(\)"),
-        ({"disc_places": [0.2, 0.1]}, "Tendon.disc_places: got .*, need ascending abscissas"),
-        ({"disc_places": [0.2], "end": 0.15}, "Tendon.disc_places: got .*, need ascending"),
-        ({"disc_places": [-0.1]}, "Tendon.disc_places: got .*, need finite numbers > 0"),
+        ((0,), {}, "Discs.number: got 0, need an integer >= 1"),
+        ((), {}, "Discs: got number=None and places=None, need one of the two"),
+        ((2,), {"places": [0.1]}, "Discs: got number=2 and places=.*, need one of the two"),
+        ((), {"places": 0.1}, r"Discs.places: got shape \(\), need abscissas in a row"),
+        ((), {"places": [0.2, 0.1]}, "Discs.places: got .*, need ascending abscissas"),
+        ((), {"places": [-0.1]}, "Discs.places: got .*, need finite numbers > 0"),
+        ((3,), {"radius": 0.0}, "Discs.radius: got 0.0, need"),
+        ((3,), {"mass": -1.0}, "Discs.mass: got -1.0, need"),
+        ((3,), {"mass": [1.0, 2.0]}, r"Discs.mass: got shape \(2,\), need one mass or 3"),
     ],
 )
-def test_wrong_discs_are_refused(options, message):
+def test_wrong_discs_are_refused(arguments, options, message):
     with pytest.raises(ValueError, match=message):
-        vsr.Tendon(PATHS[0], **options)
+        vsr.Discs(*arguments, **options)
 
 
-def test_discs_beyond_the_arm_are_refused():
-    message = r"Scene.actuators\[0\].disc_places: got 0.1 to 0.4 m, need ascending abscissas"
+@pytest.mark.parametrize(
+    ("discs", "options", "message"),
+    [
+        ([0.1, 0.4], {}, r"Scene.rod.discs: got a disc at 0.4 m, need places on the arm of 0.3 m"),
+        (None, {}, r"actuators\[0\].straight: got True on a rod without discs, need Rod\(discs"),
+        (3, {"end": 0.15}, r"actuators\[0\].end: got 0.15 m, need the place of a disc, such as"),
+        (3, {"start": 0.05}, r"actuators\[0\].start: got 0.05 m, need the place of a disc"),
+    ],
+)
+def test_straight_tendons_without_the_discs_they_need_are_refused(discs, options, message):
     with pytest.raises(ValueError, match=message):
-        scene(disc_places=[0.1, 0.4])
+        vsr.Scene(arm(discs), [vsr.Tendon(PATHS[0], straight=True, **options)])
+
+
+def test_the_weight_of_discs_is_that_of_payloads():
+    """One mass for all, and one for each."""
+    for mass in (0.02, [0.01, 0.0, 0.03]):
+        rod = vsr.Rod(
+            LENGTH,
+            vsr.Circular(RADIUS),
+            MATERIAL,
+            discs=vsr.Discs(places=[0.1, 0.2, 0.3], mass=mass),
+        )
+        found = vsr.solve(vsr.Scene(rod, [], [vsr.Gravity()]), [], model=STEPS, throw=True)
+        each = zip([0.1, 0.2, 0.3], np.broadcast_to(mass, 3), strict=True)
+        loads = [vsr.Gravity(), *(vsr.Payload(float(m), X) for X, m in each)]
+        expected = vsr.solve(vsr.Scene(arm(), [], loads), [], model=STEPS, throw=True)
+        np.testing.assert_allclose(found.tip, expected.tip, atol=1e-9)
+        np.testing.assert_allclose(found.energy.total, expected.energy.total, rtol=1e-9)
 
 
 @pytest.mark.parametrize(
     "model", [vsr.Prescribed(vsr.Basis.uniform(vsr.Legendre(2))), vsr.Continuum()]
 )
 def test_other_models_name_the_one_for_discs(model):
-    with pytest.raises(ValueError, match=r"actuators\[0\].discs.*need StrainDependent"):
+    with pytest.raises(ValueError, match=r"actuators\[0\].straight.*need StrainDependent"):
         vsr.solve(scene(discs=3), TENSIONS, model=model)

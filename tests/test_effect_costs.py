@@ -49,7 +49,7 @@ def test_other_scenes_add_one_effect_to_the_scene_that_they_name():
             assert base.scene.obstacles[0].friction is None
             assert one.scene.replace("obstacles[0].friction", 0.1).obstacles[0].friction == 0.1
     assert added == [
-        ["sections", "discs"],
+        ["sections", "straight tendons"],
         ["sections", "rigid pieces"],
         ["held section"],
         ["cylinder"],

@@ -58,15 +58,13 @@ def test_drilling_plan_and_lengths():
 
 
 def two_sections():
-    """Three cables to the middle through ten discs, and three to the tip that share these and have
-    others beyond."""
-    rod = vsr.Rod(0.2, vsr.Circular(5e-4), SOFT, guide_radius=0.009)
+    """Three cables to the middle through ten discs, and three to the tip through all."""
+    places = [*np.arange(1, 11) * 0.01, 0.12, 0.16, 0.19, 0.2]
+    rod = vsr.Rod(0.2, vsr.Circular(5e-4), SOFT, discs=vsr.Discs(places=places, radius=0.009))
     ways = [(8e-3 * np.cos(a), 8e-3 * np.sin(a)) for a in np.arange(6) * np.pi / 3]
-    inner = [vsr.Tendon(vsr.Parallel(*way), discs=10, end=0.1) for way in ways[::2]]
-    places = [*np.arange(1, 11) * 0.01, 0.12, 0.16, 0.19]
-    return vsr.Scene(
-        rod, [*inner, *(vsr.Tendon(vsr.Parallel(*w), disc_places=places) for w in ways[1::2])]
-    )
+    paths = [vsr.Parallel(*way) for way in ways]
+    inner = [vsr.Tendon(path, end=0.1, straight=True) for path in paths[::2]]
+    return vsr.Scene(rod, [*inner, *(vsr.Tendon(path, straight=True) for path in paths[1::2])])
 
 
 @pytest.mark.slow
@@ -147,7 +145,7 @@ def test_oblique_channels_are_round():
 def test_threads_in_the_open_have_no_channel():
     """On discs outside a tube, and in its lumen."""
     section = vsr.Annular(0.004, 0.0037)
-    rod = vsr.Rod(0.1, section, SOFT, guide_radius=0.006)  # a thin wall
+    rod = vsr.Rod(0.1, section, SOFT, discs=vsr.Discs(10, radius=0.006))  # a thin wall
     paths = [vsr.Parallel(0.0, 0.005), vsr.Parallel(0.001, 0.0)]
     made = vsr.export(vsr.Scene(rod, [vsr.Tendon(path) for path in paths]))
     area = float(section.geometry(jnp.asarray(0.05), rod.length).area)

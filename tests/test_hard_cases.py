@@ -31,7 +31,11 @@ def arm(*threads, length=0.3, radius=0.01, tip=1.0, young=1e6, pitch=STRAIGHT, c
         vsr.Material(young, poisson=0.45),
     )
     rod = vsr.Rod(
-        length, section, material, rest_strain=(0.0, 0.0, curved, 1.0, 0.0, 0.0), guide_radius=10.0
+        length,
+        section,
+        material,
+        rest_strain=(0.0, 0.0, curved, 1.0, 0.0, 0.0),
+        discs=vsr.Discs(10, radius=10.0),
     )
     places = (*threads, (0.0, 0.0))[:2]
     helices = [
@@ -313,7 +317,7 @@ def test_a_strain_that_is_not_found_between_the_nodes_is_not_returned():
         length,
         vsr.Circular(radius),
         vsr.Material(young, poisson=0.45, density=10.874),
-        guide_radius=2 * radius,
+        discs=vsr.Discs(10, radius=2 * radius),
     )
     scene = vsr.Scene(
         rod,

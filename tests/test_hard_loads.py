@@ -261,7 +261,12 @@ def test_arms_of_all_sizes_and_stiffnesses_behave_alike(length, young, dtype):
 def six_tendon_arm(loads=()):
     """Two sections of 0.2 m; tendons at 10 mm, at 90, -30 and 210 degrees, three to the middle and
     three to the end."""
-    rod = vsr.Rod(0.4, vsr.Circular(0.0007), vsr.Material(54e9, poisson=0.3), guide_radius=0.0101)
+    rod = vsr.Rod(
+        0.4,
+        vsr.Circular(0.0007),
+        vsr.Material(54e9, poisson=0.3),
+        discs=vsr.Discs(10, radius=0.0101),
+    )
     places = [
         (0.01 * math.cos(angle), 0.01 * math.sin(angle))
         for angle in (math.pi / 2, -math.pi / 6, 7 * math.pi / 6)

@@ -296,7 +296,9 @@ def test_the_outline_of_a_rod(section, radius):
     np.testing.assert_allclose(rod.outline(X), radius, rtol=1e-14)
     y, z = section.outline(jnp.linspace(0, 2 * np.pi, 721), X, rod.length)
     np.testing.assert_allclose(np.max(np.hypot(y, z)), radius, rtol=1e-12)
-    guided = vsr.Rod(0.3, section, vsr.Material(8e5, poisson=0.45), guide_radius=0.03)
+    guided = vsr.Rod(
+        0.3, section, vsr.Material(8e5, poisson=0.45), discs=vsr.Discs(10, radius=0.03)
+    )
     assert guided.outline(X) == 0.03
 
 
@@ -381,7 +383,7 @@ def test_an_arm_may_leave_a_tube_at_rest_but_must_start_in_it():
         vsr.Scene(arm(), obstacles=[vsr.Tube(0.02, LINE + np.array([0.0, 0.0, 0.015]))])
     assert 0.003 < depth_of(error) <= 0.005
     with pytest.raises(ValueError, match=r"got 0.015 m .* need more .* 0.02 m"):
-        vsr.Scene(arm(guide_radius=0.02), obstacles=[vsr.Tube(0.015)])
+        vsr.Scene(arm(discs=vsr.Discs(10, radius=0.02)), obstacles=[vsr.Tube(0.015)])
 
 
 @pytest.mark.parametrize(

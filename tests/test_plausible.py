@@ -20,14 +20,12 @@ HELIX = (FOLDER / "scenes" / "helix.toml").read_text()
 PARALLEL = 'type = "Parallel", y = 0.0, z = 0.0'
 
 
-def arm(
-    *, length=0.3, radius=0.01, young=1e6, shear=3e5, density=1e3, guide_radius=0.02, area=1e-5
-):
+def arm(*, length=0.3, radius=0.01, young=1e6, shear=3e5, density=1e3, rim=0.02, area=1e-5):
     rod = vsr.Rod(
         length,
         vsr.Circular(radius),
         vsr.Material(young, shear=shear, density=density),
-        guide_radius=guide_radius,
+        discs=vsr.Discs(10, radius=rim),
     )
     return vsr.Scene(rod, [vsr.Chamber(vsr.Parallel(0.0, 0.0), area)])
 
@@ -49,8 +47,8 @@ def arm(
             "rod.section: half thickness: 7 m; arms have 5 um to 500 mm; is it in millimetres?",
         ),
         (
-            {"guide_radius": 10.0},
-            "rod.guide_radius: 10 m; arms have 5 um to 500 mm; is it in millimetres?",
+            {"rim": 10.0},
+            "rod.discs.radius: 10 m; arms have 5 um to 500 mm; is it in millimetres?",
         ),
         (
             {"radius": 0.2},

@@ -53,7 +53,7 @@ BENT = vsr.Rod(
     vsr.Material(1e6, poisson=0.5, density=1e3),
     rest_strain=lambda X: (0.0, X, 0.0, 1.0, 0.0, 0.0),
     rigid=vsr.RigidPiece(0.4),
-    guide_radius=0.03,
+    discs=vsr.Discs(10, radius=0.03),
 )
 SMOOTH, FORWARD = vsr.Spline([0.0, 0.2, 0.5], [0.0, 0.01, 0.0], [0.0, 0.0, 0.0]), [1.0, 0.0, 0.0]
 PARTS = [
@@ -65,10 +65,15 @@ PARTS = [
     *(BENT.rigid[0], vsr.Scene(BENT, SCENE.actuators, [vsr.DistributedWrench(FORWARD)])),
     *(
         vsr.Tendon(SMOOTH, end=0.4),
-        vsr.Tendon(SMOOTH, discs=3),
+        vsr.Tendon(SMOOTH, straight=True),
         vsr.Tendon(SMOOTH, control="length"),
     ),
-    *(vsr.Tendon(SMOOTH, disc_places=[0.1]), vsr.Thread(SMOOTH), vsr.Chamber(SMOOTH, area=1e-5)),
+    *(
+        vsr.Discs(3),
+        vsr.Discs(places=[0.1], mass=0.1),
+        vsr.Thread(SMOOTH),
+        vsr.Chamber(SMOOTH, area=1e-5),
+    ),
     *(vsr.Gravity(), vsr.DistributedWrench(lambda X: (X, 0.0, 0.0)), vsr.TipWrench(FORWARD)),
     *(vsr.Spring(FORWARD, 1.0), vsr.Payload(0.1), vsr.Spinning(FORWARD)),
     *(vsr.MagneticMoment(FORWARD, lambda r: r), vsr.MagneticDensity(lambda X: (X, 0, 0), FORWARD)),
@@ -120,9 +125,9 @@ def test_methods_take_numbers_of_python(part, numbers):
             assert shapes(method, *given) == shapes(method, *arrays), name
 
 
-def test_holes_and_edges_of_plain_numbers():
-    tendon = vsr.Tendon(vsr.Parallel(0.005, 0.0), discs=2)
-    np.testing.assert_allclose(jax.jit(lambda: tendon.holes(0.215))(), [0.0, 0.1075, 0.215])
+def test_discs_and_edges_of_plain_numbers():
+    discs = vsr.Discs(2)
+    np.testing.assert_allclose(jax.jit(lambda: discs.along(0.215))(), [0.1075, 0.215])
     np.testing.assert_allclose(jax.jit(lambda: SCENE.edges([0.1]))(), [0.0, 0.1, 0.5])
 
 
@@ -323,7 +328,12 @@ def test_single_precision_may_round_a_place_off_the_arm(bent):
 
 @pytest.mark.slow
 def test_discs_may_guide_threads_outside_the_section():
-    arm = vsr.Rod(0.4, vsr.Circular(0.0007), vsr.Material(54e9, poisson=0.3), guide_radius=0.012)
+    arm = vsr.Rod(
+        0.4,
+        vsr.Circular(0.0007),
+        vsr.Material(54e9, poisson=0.3),
+        discs=vsr.Discs(10, radius=0.012),
+    )
     eq = vsr.solve(vsr.Scene(arm, [vsr.Tendon(vsr.Parallel(0.01, 0.0))]), [2.0])
     EA, EI = 54e9 * np.pi * 0.0007**2, 54e9 * np.pi / 4 * 0.0007**4
     np.testing.assert_allclose(
@@ -331,13 +341,13 @@ def test_discs_may_guide_threads_outside_the_section():
     )
 
 
-def test_no_guide_radius_is_advised_to_a_rod_that_has_one():
+def test_no_discs_are_advised_to_a_rod_that_has_them():
     wire, steel = vsr.Circular(0.0007), vsr.Material(54e9, poisson=0.3)
     thread = vsr.Tendon(vsr.Parallel(0.01, 0.0))
-    with pytest.raises(ValueError, match=r"the section \(or give the rod a guide_radius\)$"):
+    with pytest.raises(ValueError, match=r"the section \(or give the rod discs with a radius\)$"):
         vsr.Scene(vsr.Rod(0.4, wire, steel), [thread])
-    with pytest.raises(ValueError, match=r"inside the guide_radius of 0\.008 m$"):
-        vsr.Scene(vsr.Rod(0.4, wire, steel, guide_radius=0.008), [thread])
+    with pytest.raises(ValueError, match=r"inside the discs' radius of 0\.008 m$"):
+        vsr.Scene(vsr.Rod(0.4, wire, steel, discs=vsr.Discs(10, radius=0.008)), [thread])
 
 
 @pytest.mark.slow

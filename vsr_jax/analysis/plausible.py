@@ -87,7 +87,7 @@ _DENSITY = _Range(50.0, 25000.0, "kg/m^3", "materials have {}", ((1e3, "g/cm^3")
 _RANGES = {
     "rod.length": _LENGTH,
     "rod.section: half thickness": _THICKNESS,
-    "rod.guide_radius": _THICKNESS,
+    "rod.discs.radius": _THICKNESS,
     "rod.material.young": _MODULUS,
     "rod.material.shear": _MODULUS,
     "rod.material.density": _DENSITY,
@@ -131,8 +131,8 @@ def _doubts(scene: Scene) -> Iterator[str]:
     length, thickness = float(rod.length), float(np.mean(measures.thickness))
     values = {"rod.length": length, "rod.section: half thickness": thickness}
     values |= {f"rod.material.{name}": value for name, value in measures.material.items()}
-    if rod.guide_radius is not None:
-        values["rod.guide_radius"] = float(rod.guide_radius)
+    if rod.rim is not None:
+        values["rod.discs.radius"] = float(rod.rim)
     for name, range_ in _RANGES.items():
         if name in values:
             yield from range_.doubts(name, values[name])
@@ -197,7 +197,7 @@ def _measured(scene: Scene) -> _Measures:
 
     def at(x: Array) -> _Measures:
         thickness = rod.section.clearance(zero, zero, x, rod.length)
-        wide = thickness if rod.guide_radius is None else jnp.maximum(thickness, rod.guide_radius)
+        wide = thickness if rod.rim is None else jnp.maximum(thickness, rod.rim)
         area = jnp.maximum(rod.section.geometry(x, rod.length).area, jnp.pi * wide**2)
         return _Measures(
             thickness,

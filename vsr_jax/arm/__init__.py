@@ -5,6 +5,7 @@ Data and their geometry only. Must not know how an equilibrium is found or how a
 """
 
 from .actuator import Actuator, Chamber, Tendon, Thread, ThreadState
+from .discs import Discs
 from .held import Held, Support
 from .loads import DistributedWrench, Frame, Gravity, Load, PointWrench, TipWrench
 from .material import Material
@@ -46,6 +47,7 @@ __all__ = [
     "Constant",
     "CrossSections",
     "Cylinder",
+    "Discs",
     "DistributedWrench",
     "Elliptic",
     "Field",

@@ -6,11 +6,10 @@ from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
-from ..typing import Scalar, ScalarLike, VectorLike, real
-from ..validation import choice, concrete, count, instance, numbers
+from ..typing import Scalar, ScalarLike, real
+from ..validation import choice, concrete, instance, numbers
 from .description import Part
 from .routing import Routing
 
@@ -45,6 +44,8 @@ class Actuator(Part):
     start: eqx.AbstractVar[Scalar | None]
     end: eqx.AbstractVar[Scalar | None]
     effect: eqx.AbstractClassVar[str]
+    straight = False
+    """Whether the thread runs straight between the discs of the arm, in place of along its path."""
 
     @property
     @abstractmethod
@@ -90,23 +91,6 @@ class Actuator(Part):
     def pressure_area(self) -> Scalar | None:
         """Area [m^2] on which a pressure acts; None if the input is no pressure."""
         return None
-
-    @property
-    def straight(self) -> bool:
-        """Whether the thread runs straight from hole to hole, in place of along its path."""
-        return False
-
-    @property
-    def even_discs(self) -> int | None:
-        """Number of the thread's discs, if they are evenly spaced over the whole arm."""
-        return None
-
-    def holes(self, length: ScalarLike) -> Float[Array, " holes"]:
-        """Abscissas [m], ascending, of the holes between which the thread of an arm of `length` [m]
-        runs: its two ends, and its discs where it is `straight`."""
-        length = real(length)
-        start = jnp.zeros_like(length) if self.start is None else self.start
-        return jnp.stack([start, length if self.end is None else self.end])
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -196,24 +180,22 @@ class Tendon(Actuator):
     convergence is that of the nodes of a step, third for steps of order 6. The input and the
     computed tension are those at the start.
 
-    With discs it runs straight from hole to hole, as the tendons of most arms with a thin backbone
-    do, and slides through them without friction. The holes are where the routing crosses its start,
-    the discs and its end, $p_i = r(D_i) + R(D_i) d(D_i)$. Then $l = \sum_i |p_{i+1} - p_i|$, and a
-    section between two discs carries the wrench of the chord there, $\tau e$ through $p_i$ with
-    $e = (p_{i+1} - p_i) / |p_{i+1} - p_i|$. Each disc is the end of a step. The model is
-    `StrainDependent`.
+    A `straight` one runs in straight lines through the holes of the rod's `Discs`, as the tendons
+    of most arms with a thin backbone do. The holes are where the routing crosses the base and the
+    discs, $p_i = r(D_i) + R(D_i) d(D_i)$. Then $l = \sum_i |p_{i+1} - p_i|$, and a section between
+    two discs carries the wrench of the chord there, $\tau e$ through $p_i$ with $e = (p_{i+1} -
+    p_i) / |p_{i+1} - p_i|$. With friction the tension changes at each hole between its ends by
+    $e^{\mp \mu \varphi}$, with the angle $\varphi$ between the chords there. Each disc is the end
+    of a step. The model is `StrainDependent`.
 
     **Arguments:**
-    - `routing`, `start`, `end`: as for every actuator.
+    - `routing`, `start`, `end`: as for every actuator; a straight one starts and ends in discs, by
+      default at the base and in the last disc.
     - `control`: `"tension"` or `"length"`.
     - `stiffness`: $k$ [N], for `control="length"` only.
     - `friction`: coefficient $\mu$ [-], none by default.
     - `motion`: `"pull"` or `"release"`, the direction in which friction acts.
-    - `discs`: number of discs, evenly spaced, the last at the end of the cable; none by default.
-    - `disc_places`: instead of their number, the abscissas [m] of the discs between the ends of the
-      cable, ascending. It has a hole at each end too.
-
-    **Raises:** `ValueError` for discs together with friction.
+    - `straight`: whether it runs straight between the discs of the rod, not along its path.
     """
 
     routing: Routing
@@ -221,8 +203,7 @@ class Tendon(Actuator):
     end: Scalar | None = eqx.field(metadata={"unit": "m"})
     stiffness: Scalar | None = eqx.field(metadata={"unit": "N"})
     friction: Scalar | None = eqx.field(metadata={"unit": "-"})
-    disc_places: Float[Array, " discs"] | None = eqx.field(metadata={"unit": "m"})
-    discs: int | None = eqx.field(static=True)
+    straight: bool = eqx.field(static=True)
     control: Literal["tension", "length"] = eqx.field(static=True)
     motion: Literal["pull", "release"] = eqx.field(static=True)
     effect = "tendons"
@@ -237,8 +218,7 @@ class Tendon(Actuator):
         stiffness: ScalarLike | None = None,
         friction: ScalarLike | None = None,
         motion: Literal["pull", "release"] = "pull",
-        discs: int | None = None,
-        disc_places: VectorLike | None = None,
+        straight: bool = False,
     ):
         self.routing, self.start, self.end = _checked("Tendon", routing, start, end)
         self.control = choice("Tendon.control", control, ("tension", "length"))
@@ -254,40 +234,7 @@ class Tendon(Actuator):
             None if friction is None else numbers("Tendon.friction", friction, least=0.0)
         )
         self.motion = choice("Tendon.motion", motion, ("pull", "release"))
-        if discs is not None and disc_places is not None:
-            raise ValueError(
-                f"Tendon.disc_places: got {disc_places!r} and discs={discs!r}, need one of the two"
-            )
-        self.discs = None if discs is None else count("Tendon.discs", discs)
-        self.disc_places = None if disc_places is None else self._places(disc_places)
-        if self.straight and friction is not None:
-            raise ValueError(
-                f"Tendon.friction: got {friction!r} with discs, need a tendon without discs or "
-                f"without friction (friction in the holes of discs is not modelled)"
-            )
-
-    def _places(self, disc_places: VectorLike) -> Float[Array, " discs"]:
-        """The abscissas of the discs, checked against each other and the ends of the tendon."""
-        places = numbers("Tendon.disc_places", disc_places, None, positive=True)
-        if places.ndim != 1:
-            raise ValueError(
-                f"Tendon.disc_places: got shape {places.shape}, need abscissas in a row"
-            )
-        known = [concrete(x) for x in (places, self.start, self.end) if x is not None]
-        if all(x is not None for x in known):
-            rising = np.concatenate(
-                [
-                    [] if self.start is None else [float(self.start)],
-                    np.asarray(places),
-                    [] if self.end is None else [float(self.end)],
-                ]
-            )
-            if np.any(np.diff(rising) <= 0):
-                raise ValueError(
-                    f"Tendon.disc_places: got {disc_places!r}, need ascending abscissas between "
-                    f"the ends of the tendon"
-                )
-        return places
+        self.straight = bool(straight)
 
     @property
     def unit(self) -> str:
@@ -316,19 +263,8 @@ class Tendon(Actuator):
         return self.stiffness
 
     @property
-    def straight(self) -> bool:
-        return self.discs is not None or self.disc_places is not None
-
-    @property
-    def even_discs(self) -> int | None:
-        return self.discs if self.start is None and self.end is None else None
-
-    def holes(self, length: ScalarLike) -> Float[Array, " holes"]:
-        start, end = super().holes(length)
-        if self.disc_places is not None:
-            return jnp.concatenate([start[None], self.disc_places, end[None]])
-        share = jnp.arange(1 + (self.discs or 1), dtype=end.dtype) / (self.discs or 1)
-        return start + (end - start) * share
+    def breakpoints(self) -> tuple[Scalar, ...]:
+        return () if self.straight else super().breakpoints
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -336,7 +272,7 @@ class Tendon(Actuator):
             ("length control", self.length_driven),
             ("elastic tendons", self.stiffness is not None),
             ("friction", self.frictional),
-            ("discs", self.straight),
+            ("straight tendons", self.straight),
         )
         return (self.effect, *(name for name, present in options if present))
 

@@ -121,8 +121,8 @@ def _with_unit(text: str, unit: str) -> str:
 
 
 def _is_neutral(value: Any, default: Any) -> bool:
-    """Whether an argument has its default and that is zeros, ones or the name of an option."""
-    if isinstance(value, str):
+    """Whether an argument has its default and that is zeros, ones or an option."""
+    if isinstance(value, str | bool):
         return value == default
     if isinstance(value, tuple | list):
         same_size = isinstance(default, tuple | list) and len(default) == len(value)

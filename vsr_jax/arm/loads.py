@@ -45,6 +45,11 @@ class Load(Part):
         """Abscissa [m] and wrench $(M, F)$ of a load at a point; None for a load per length."""
         return None
 
+    def points(self, rod: Rod) -> tuple[tuple[Scalar, Wrench], ...]:
+        """Abscissas [m] and wrenches $(M, F)$ of all that the load exerts at points."""
+        point = self.point(rod)
+        return () if point is None else (point,)
+
     def place(self, rod: Rod) -> Scalar | None:
         """Abscissa [m] of a load at a point; None for a load per length."""
         point = self.point(rod)
@@ -76,6 +81,9 @@ class _ScaledLoad(Load):
         point = self.load.point(rod)
         return None if point is None else (point[0], scale(self.factor, point[1]))
 
+    def points(self, rod: Rod) -> tuple[tuple[Scalar, Wrench], ...]:
+        return tuple((X, scale(self.factor, wrench)) for X, wrench in self.load.points(rod))
+
     def breakpoints(self, rod: Rod) -> tuple[Scalar, ...]:
         return self.load.breakpoints(rod)
 
@@ -98,7 +106,8 @@ def mass_per_length(rod: Rod, X: ScalarLike, displaced: Scalar | None = None) ->
 
 
 class Gravity(Load):
-    r"""Weight minus buoyancy: $f = (\rho - \rho_f) A g$ per length, in the world frame.
+    r"""Weight minus buoyancy: $f = (\rho - \rho_f) A g$ per length, in the world frame, and the
+    weights of the rod's discs, if they have a mass.
 
     **Arguments:**
     - `acceleration`: $g$ [m/s^2] in the world frame, (0, 0, -9.81) by default.
@@ -134,9 +143,22 @@ class Gravity(Load):
 
     def density(self, rod: Rod, X: ScalarLike) -> Wrench:
         weight = mass_per_length(rod, X, self.fluid_density)
-        zero = jnp.zeros_like(weight)
-        x, y, z = (weight * g for g in self.acceleration)
-        return zero, zero, zero, x, y, z
+        return _force(weight, self.acceleration)
+
+    def points(self, rod: Rod) -> tuple[tuple[Scalar, Wrench], ...]:
+        """The weights of the discs."""
+        discs = rod.discs
+        if discs is None or discs.mass is None:
+            return ()
+        X, mass = discs.along(rod.length), jnp.broadcast_to(discs.mass, (discs.size,))
+        return tuple((X[i], _force(mass[i], self.acceleration)) for i in range(discs.size))
+
+
+def _force(mass: Scalar, acceleration: Array) -> Wrench:
+    """The wrench of a weight."""
+    zero = jnp.zeros_like(mass)
+    x, y, z = (mass * g for g in acceleration)
+    return zero, zero, zero, x, y, z
 
 
 class PointWrench(Load):

@@ -11,6 +11,7 @@ from ..numerics.se3 import nearest_pose
 from ..typing import ArrayLike, MatrixLike, Pose, Scalar, ScalarLike, real
 from ..validation import instance, instances, numbers, rigid as rigid_transform
 from .description import Part
+from .discs import Discs
 from .material import Material
 from .profile import (
     Limits,
@@ -45,8 +46,8 @@ class Rod(Part):
       elongation $u_x^*$ must be positive.
     - `base`: pose of the section at X = 0, a rigid transform of shape (4, 4), of which six digits
       are enough; the identity by default.
-    - `guide_radius`: radius [m] of discs that guide the threads outside the section; by default
-      the threads are inside the section.
+    - `discs`: the `Discs` that guide the threads outside the section; by default the threads are
+      inside the section.
     - `rigid`: the `RigidPiece`s of the arm, parts of it that do not bend.
     """
 
@@ -55,7 +56,7 @@ class Rod(Part):
     material: Material
     rest_strain: ProfileVector = eqx.field(metadata={"unit": _STRAIN_UNITS})
     base: Pose | None = eqx.field(metadata={"unit": "-"})
-    guide_radius: Scalar | None = eqx.field(metadata={"unit": "m"})
+    discs: Discs | None
     rigid: tuple[RigidPiece, ...]
 
     def __init__(
@@ -66,7 +67,7 @@ class Rod(Part):
         *,
         rest_strain: ProfilesLike | None = STRAIGHT,
         base: MatrixLike | None = None,
-        guide_radius: ScalarLike | None = None,
+        discs: Discs | None = None,
         rigid: Sequence[RigidPiece] | RigidPiece = (),
     ):
         self.length = numbers("Rod.length", length, positive=True)
@@ -84,11 +85,7 @@ class Rod(Part):
             f"six profiles in the order {', '.join(STRAINS)}, or a function of X",
         )
         self.base = None if base is None else rigid_transform("Rod.base", base)
-        self.guide_radius = (
-            None
-            if guide_radius is None
-            else numbers("Rod.guide_radius", guide_radius, positive=True)
-        )
+        self.discs = None if discs is None else instance("Rod.discs", discs, Discs, "Discs or None")
         self.rigid = instances("Rod.rigid", rigid, RigidPiece, "a RigidPiece")
 
     @property
@@ -135,20 +132,23 @@ class Rod(Part):
             ),
         }
 
+    @property
+    def rim(self) -> Scalar | None:
+        """Radius [m] of the discs; None without discs of a known one."""
+        return None if self.discs is None else self.discs.radius
+
     def clearance(self, y: ScalarLike, z: ScalarLike, X: ScalarLike) -> Array:
         """Distance [m] from (y, z) to the section's wall or the guide at X: positive inside."""
         inside = self.section.clearance(y, z, X, self.length)
         return (
-            inside
-            if self.guide_radius is None
-            else jnp.maximum(inside, self.guide_radius - norm((real(y), real(z))))
+            inside if self.rim is None else jnp.maximum(inside, self.rim - norm((real(y), real(z))))
         )
 
     def outline(self, X: ScalarLike) -> Scalar:
         """Radius [m] of the round outline of the arm about its axis at X: that of the section, of
-        its corners where it is not round, or `guide_radius` if that is greater."""
+        its corners where it is not round, or of the discs if that is greater."""
         radius = self.section.outer_radius(X, self.length)
-        return radius if self.guide_radius is None else jnp.maximum(radius, self.guide_radius)
+        return radius if self.rim is None else jnp.maximum(radius, self.rim)
 
     @property
     def breakpoints(self) -> tuple[Scalar, ...]:

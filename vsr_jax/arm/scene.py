@@ -17,7 +17,6 @@ from ..typing import ArrayLike, DTypeLike, Scalar, ScalarLike, VectorLike, cast,
 from ..validation import concrete, instance, instances, is_traced, numbers, precise
 from .actuator import Actuator
 from .description import Part, describe, described_arguments, table
-from .discs import inner_discs, rest_length
 from .held import Support
 from .loads import Frame, Load
 from .obstacles import Obstacle
@@ -27,6 +26,7 @@ from .routing import Path
 from .scene_checks import check_held, check_numbers, check_obstacles
 from .scene_numbers import checked_values, replaced
 from .section_law import SectionLaw
+from .thread_lines import rest_length
 
 
 class CrossSections(NamedTuple):
@@ -98,11 +98,12 @@ class Scene(Part):
 
     **Raises:** `ValueError` if
 
-    - a thread is outside the section (or the rod's `guide_radius`),
+    - a thread is outside the section (or the rod's discs),
     - a size, a modulus, a density or the rest elongation is not positive somewhere,
     - a tube has no wall, or Poisson's ratio is out of its range,
     - a thread ends or a load acts beyond the arm,
     - a rigid piece is beyond the arm, two of them overlap, or they cover all of the arm,
+    - a straight tendon has no discs, or does not start and end in discs,
     - there is gravity and the material has no density,
     - an obstacle has no size, a tube is narrower than the arm, or the arm starts inside an obstacle
       or outside a tube.
@@ -226,10 +227,19 @@ class Scene(Part):
         return (
             *self.rod.breakpoints,
             *laid,
-            *inner_discs(self.rod, self.actuators),
+            *self._acting_discs,
             *(x for load in self.loads for x in load.breakpoints(self.rod)),
             *(held.X for held in self.held if held.X is not None),
         )
+
+    @property
+    def _acting_discs(self) -> tuple[Scalar, ...]:
+        """Abscissas [m] of the discs before the tip, where these are more than guides."""
+        discs = self.rod.discs
+        if discs is None or not (self.straight or (discs.mass is not None and self.loads)):
+            return ()
+        X = discs.along(self.rod.length)
+        return tuple(X[i] for i in range(discs.size if discs.number is None else discs.size - 1))
 
     def edges(self, more: Sequence[ScalarLike] = ()) -> Float[Array, " edges"]:
         """Ends of the smooth pieces of the arm [m], `more` breakpoints included."""
@@ -276,9 +286,8 @@ class Scene(Part):
         return total
 
     def point_wrenches(self, frame: Frame) -> tuple[tuple[Scalar, Wrench], ...]:
-        """Abscissa and wrench $(M, F)$ of each load of a frame that acts at a point."""
-        points = [load.point(self.rod) for load in self._fixed(frame)]
-        return tuple(point for point in points if point is not None)
+        """Abscissas and wrenches $(M, F)$ of the loads of a frame that act at points."""
+        return tuple(point for load in self._fixed(frame) for point in load.points(self.rod))
 
     def _fixed(self, frame: Frame) -> list[Load]:
         """The loads whose wrench is constant in a frame."""

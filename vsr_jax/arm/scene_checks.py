@@ -13,7 +13,7 @@ from ..numerics.se3 import base_pose
 from ..typing import Scalar
 from ..validation import ROUNDING, concrete, is_traced, numbers
 from .actuator import Actuator
-from .discs import check_discs
+from .discs import SAME
 from .held import Support
 from .loads import Load
 from .obstacles import Obstacle
@@ -54,11 +54,11 @@ def check_numbers(
     for i, values in enumerate(clearances):
         j = int(np.argmin(values))
         if not values[j] > -ROUNDING * length:
-            guide = rod.guide_radius
+            guide = rod.rim
             outside, needed = (
-                ("section", "the section (or give the rod a guide_radius)")
+                ("section", "the section (or give the rod discs with a radius)")
                 if guide is None
-                else ("section and the guides", f"the guide_radius of {float(guide):g} m")
+                else ("section and the discs", f"the discs' radius of {float(guide):g} m")
             )
             raise ValueError(
                 f"Scene.actuators[{i}].routing: the thread is {-values[j]:.3g} m outside the "
@@ -69,8 +69,8 @@ def check_numbers(
 def _check_places(
     length: float, rod: Rod, actuators: Sequence[Actuator], loads: Sequence[Load]
 ) -> None:
-    """Raises `ValueError` for rigid pieces that the arm cannot have, and if a thread end or a point
-    load is beyond the arm."""
+    """Raises `ValueError` for rigid pieces that the arm cannot have, and if a thread end, a disc or
+    a point load is beyond the arm."""
     check_pieces("Scene.rod.rigid", rod.rigid, length)
     beyond = length * (1 + ROUNDING)
     for i, actuator in enumerate(actuators):
@@ -81,12 +81,32 @@ def _check_places(
                     f"arm of {length:g} m"
                 )
         if actuator.straight:
-            check_discs(f"Scene.actuators[{i}]", actuator, rod.length)
+            _check_straight(f"Scene.actuators[{i}]", actuator, rod)
+    last = 0.0 if rod.discs is None else float(rod.discs.along(length)[-1])
+    if last > beyond:
+        raise ValueError(
+            f"Scene.rod.discs: got a disc at {last:g} m, need places on the arm of {length:g} m"
+        )
     for i, load in enumerate(loads):
         X = load.place(rod)
         if X is not None and float(X) > beyond:
             raise ValueError(
                 f"Scene.loads[{i}].X: got {float(X):g} m, need a place on the arm of {length:g} m"
+            )
+
+
+def _check_straight(name: str, actuator: Actuator, rod: Rod) -> None:
+    """Raises `ValueError` for a straight tendon without discs, or with a known end in none."""
+    if rod.discs is None:
+        raise ValueError(f"{name}.straight: got True on a rod without discs, need Rod(discs=...)")
+    length = float(rod.length)
+    places = np.concatenate([[0.0], np.asarray(rod.discs.along(length))])
+    for end, X in (("start", actuator.start), ("end", actuator.end)):
+        if X is not None and np.min(np.abs(places - float(X))) > SAME * length:
+            near = places[np.argmin(np.abs(places - float(X)))]
+            raise ValueError(
+                f"{name}.{end}: got {float(X):g} m, need the place of a disc, such as {near:g} m, "
+                f"for a straight tendon"
             )
 
 

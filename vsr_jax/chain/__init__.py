@@ -5,10 +5,18 @@ Knows neither rods nor loads: everything here takes stiffnesses, wrenches and de
 nodes of a grid.
 """
 
-from .border import Border, bordered_solve
+from .border import Border, bordered_solve, solved_with
 from .coupled import Coupled
 from .definiteness import Definiteness
 from .matrix import Chain
-from .spans import with_spans
+from .spans import Spans
 
-__all__ = ["Border", "Chain", "Coupled", "Definiteness", "bordered_solve", "with_spans"]
+__all__ = [
+    "Border",
+    "Chain",
+    "Coupled",
+    "Definiteness",
+    "Spans",
+    "bordered_solve",
+    "solved_with",
+]

@@ -1,5 +1,6 @@
 r"""The tangent system of the strains with a border, by its Schur complement."""
 
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -8,6 +9,7 @@ from jaxtyping import Array
 from ..numerics import component as c, lu
 from ..numerics.component import Vector
 from ..numerics.quadrature import Grid
+from .definiteness import Definiteness
 
 _IDLE = 0.75
 """Power of the machine epsilon below which a pivot of the Schur complement is taken to be rounding,
@@ -33,12 +35,32 @@ class Border(NamedTuple):
     resists: Array
 
 
+Solve = Callable[..., tuple[Vector, Definiteness]]
+"""Solution of a system for several right sides, components (k, stages, steps, ...)."""
+
+
 def listed(parts: tuple[Array, ...]) -> Array:
     """Arrays (m, ...) one after another, the axes behind of the same sizes."""
     if len(parts) == 1:
         return parts[0]
     shape = jnp.broadcast_shapes(*(part.shape[1:] for part in parts))
     return jnp.concatenate([jnp.broadcast_to(part, (len(part), *shape)) for part in parts])
+
+
+def solved_with(
+    solve: Solve, sides: Sequence, columns: Vector, *, apart: bool = False
+) -> tuple[Vector, Vector, Definiteness]:
+    """Solutions for right sides and what pushes them, and for columns that nothing pushes;
+    `apart`: each by a pass of its own."""
+    b, *pushes = sides
+    if apart:
+        found, definiteness = solve(b, *pushes)
+        return found, solve(columns)[0], definiteness
+    count, more = len(b[0]), len(columns[0])
+    pushes = (jnp.pad(push, [(0, more), *[(0, 0)] * (push.ndim - 1)]) for push in pushes)
+    both = tuple(map(listed, zip(b, columns, strict=True)))
+    found, definiteness = solve(both, *pushes)
+    return tuple(x[:count] for x in found), tuple(x[count:] for x in found), definiteness
 
 
 def bordered_solve(

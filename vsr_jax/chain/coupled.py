@@ -4,6 +4,8 @@ from typing import NamedTuple
 
 from jaxtyping import Array
 
+from .spans import Spans
+
 
 class Coupled(NamedTuple):
     r"""How the sections of a chain act on each other, in the world's axes, arrays (..., stages,
@@ -15,8 +17,7 @@ class Coupled(NamedTuple):
     - `density` (6, motion): derivative of the loads (c, f) by the motion of the section; `ends` (6,
       motion, steps, *arms): of loads at the ends of the steps; `cells` (6, 6): of what acts in the
       cells of the nodes, about these, behind a `part` of each cell. None where nothing changes.
-    - `joined` (steps, *arms): 0 where the arm can be cut at the end of the step, since the loads on
-      each side depend on the motions of that side relative to the cut, else 1; None without cuts.
+    - `spans`: springs across spans of the chain, about the sections at their ends; None without.
     """
 
     rotation: Array
@@ -27,10 +28,12 @@ class Coupled(NamedTuple):
     ends: Array | None = None
     cells: Array | None = None
     part: Array | None = None
-    joined: Array | None = None
+    spans: Spans | None = None
 
     @property
     def motion(self) -> int:
         """Size of the motions: 0 if all loads are dead, 3 or 6."""
+        if self.spans is not None:
+            return 6
         matrices = [x for x in (self.density, self.ends, self.cells) if x is not None]
         return matrices[0].shape[1] if matrices else 0

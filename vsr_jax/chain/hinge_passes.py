@@ -23,6 +23,8 @@ of S, count with those of the hinges. The strains in a step follow from $z_0$ an
 small difference of large forces where a stiff contact is near, they would be less exact.
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -35,13 +37,16 @@ from ..numerics.stacked import affine, columns, matmul, product, rows, transpose
 from .definiteness import asymmetry_of
 from .hinges import Hinge, before, behind, halves, solved
 from .nodes import at_node, by_place, places_of
+from .spans import SpanStiffness
 
 _SINGULAR = 64
 """Smallest pivot of the compliance of a step, relative to its diagonal, in machine epsilons: where
 strains are locked or pieces rigid, some are zero."""
 
 
-def multiplied_by_hinges(hinges: Hinge, strain: Array, grid: Grid) -> Array:
+def multiplied_by_hinges(
+    hinges: Hinge, strain: Array, grid: Grid, spans: SpanStiffness | None = None
+) -> Array:
     """Product with strains in the world's axes, (6, sides, stages, steps, *arms), of the same
     shape."""
     arms, none = hinges.width.ndim - 2, jnp.zeros_like(strain[:, :, 0, 0])
@@ -53,8 +58,9 @@ def multiplied_by_hinges(hinges: Hinge, strain: Array, grid: Grid) -> Array:
         return behind(z, link, w, still, change)[0], (z, change)
 
     def backward(end: Array, hinge: tuple) -> tuple[Array, Array]:
-        (z, change), place = hinge
+        (z, change), jump, place = hinge
         at = at_node(hinges, place, arms)
+        end = end if jump is None else end + jump
         half, ahead = columns(at.given, 0, 6), z + at.width * change
         moment, force = halves(end)
         lever = columns(at.lever, 0, 3)
@@ -68,8 +74,14 @@ def multiplied_by_hinges(hinges: Hinge, strain: Array, grid: Grid) -> Array:
             wrench, start = wrench - part * inside, start + inside
         return start, wrench
 
-    _, motions = scan(forward, none, places)
-    _, wrench = scan(backward, none, (motions, places), reverse=True)
+    tip, motions = scan(forward, none, places)
+    jumps = None
+    if spans is not None:
+        stages = grid.X.shape[0]
+        starts = jnp.concatenate([motions[0][::stages], tip[None]])
+        jumps = spans.wrenches(starts, arms)
+        jumps = jnp.zeros_like(motions[0]).at[stages - 1 :: stages].set(jumps)
+    _, wrench = scan(backward, none, (motions, jumps, places), reverse=True)
     return by_place(jnp.moveaxis(wrench, 0, 2), grid, arms)
 
 
@@ -109,16 +121,18 @@ def solved_by_hinges(
 
 
 def solved_by_joints(
-    hinges: Hinge, grid: Grid, free: tuple[int, ...]
+    hinges: Hinge, grid: Grid, free: tuple[int, ...], spans: SpanStiffness | None = None
 ) -> tuple[Array, Array, Array]:
-    """As `solved_by_hinges`, for one arm, by passes over the hinges of all steps at once and then
-    over the steps."""
+    """As `solved_by_hinges`, with stiffness across spans about the hinges, by passes over the
+    hinges of all steps at once and then over the steps."""
     found, pushed, negative, compliance = _condensed(hinges, grid, free)
-    count = len(found)
+    count, arms = len(found), hinges.width.ndim - 2
     by_slide, U, signs, left = _factors(columns(found, 6, 12))
     found, pushed_by = (_without_wrench(x) for x in (found, pushed))
-    step = rows(by_slide, 0, 6), U, signs, rows(found, 0, 6), pushed_by, columns(pushed, 6, 12)
-    z, y, W, more, Q = _joined(*step)
+    step = _Step(
+        rows(by_slide, 0, 6), U, signs, rows(found, 0, 6), pushed_by, columns(pushed, 6, 12)
+    )
+    z, y, W, more, Q = _joined(step, spans, arms)
     strain = affine(rows(found, 6, count), z) + product(rows(by_slide, 6, count), y)
     strain = strain + product(rows(left, 6, count), W)
     strain = strain.reshape(grid.X.shape[0], -1, *strain.shape[1:])
@@ -127,18 +141,20 @@ def solved_by_joints(
 
 def _condensed(hinges: Hinge, grid: Grid, free: tuple[int, ...]) -> tuple[Array, ...]:
     """The motions at the ends of all steps, followed by the strains of their nodes, and the
-    wrenches at their starts, (6 and more, columns, steps), by the motion at the start, the wrench
-    beyond the end and the right sides; the numbers of negative pivots and the compliance of the
-    first nodes."""
-    stages, steps = grid.X.shape
+    wrenches at their starts, (6 and more, columns, steps, *arms), by the motion at the start, the
+    wrench beyond the end and the right sides; the numbers of negative pivots and the compliance of
+    the first nodes."""
+    stages, others = grid.X.shape[0], hinges.width.shape[1:]
     width = hinges.given.shape[1]
     one = jnp.eye(6, width, dtype=hinges.width.dtype)
     motion, wrench = (
-        jnp.broadcast_to(x[:, :, None], (6, width, steps)) for x in (one, jnp.roll(one, 6, 1))
+        jnp.broadcast_to(x.reshape(6, width, *(1,) * len(others)), (6, width, *others))
+        for x in (one, jnp.roll(one, 6, 1))
     )
 
     def backward(end: tuple[Array, Array], stage: Array) -> tuple[tuple, tuple]:
-        start, (X, negative, compliance, _) = before(free, end, at_node(hinges, (stage,), 1))
+        hinge = at_node(hinges, (stage,), len(others))
+        start, (X, negative, compliance, _) = before(free, end, hinge)
         return start, (X, negative, compliance)
 
     order = jnp.arange(stages)
@@ -147,12 +163,12 @@ def _condensed(hinges: Hinge, grid: Grid, free: tuple[int, ...]) -> tuple[Array,
 
     def forward(z: Array, hinge: tuple) -> tuple[Array, Array]:
         X, stage = hinge
-        link, w = at_node((hinges.link, hinges.width), (stage,), 1)
-        others = jnp.pad(columns(X, 6, width), [(0, 0), (6, 0), (0, 0)])
-        return behind(z, link, w, columns(X, 0, 6), others)
+        link, w = at_node((hinges.link, hinges.width), (stage,), len(others))
+        by_others = _padded(columns(X, 6, width), 6)
+        return behind(z, link, w, columns(X, 0, 6), by_others)
 
     moved, strain = scan(forward, motion, (X, order))
-    moved = jnp.concatenate([moved, strain.reshape(-1, width, steps)])
+    moved = jnp.concatenate([moved, strain.reshape(-1, width, *others)])
     negative = jnp.sum(negative, axis=0, dtype=jnp.int32)
     return moved, jnp.concatenate(pushed), negative, compliance[0]
 
@@ -162,50 +178,90 @@ def _without_wrench(x: Array) -> Array:
     return jnp.concatenate([columns(x, 0, 6), columns(x, 12, x.shape[1])], axis=1)
 
 
-def _joined(
-    L: Array, U: Array, signs: Array, moved: Array, pushed: Array, by_wrench: Array
-) -> tuple[Array, ...]:
-    """All steps joined: the motions z at their starts, y and the wrenches beyond their ends (6,
-    sides, steps), the numbers of negative pivots, and the changes of the moments at their starts by
-    the rotations there.
+class _Step(NamedTuple):
+    """What the join of steps takes of each, (6, columns, *arms): L, U and the signs S (6, *arms),
+    (T, f), (S, s) and G."""
 
-    **Arguments:** of all steps (6, columns, steps): L, U, the signs (6, steps), (T, f), (S, s) and
-    G.
-    """
+    L: Array
+    U: Array
+    signs: Array
+    moved: Array
+    pushed: Array
+    by_wrench: Array
+
+
+def _joined(step: _Step, spans: SpanStiffness | None, arms: int) -> tuple[Array, ...]:
+    r"""All steps joined: the motions z at their starts, y and the wrenches beyond their ends (6,
+    sides, steps, *arms), the numbers of negative pivots, and the changes of the moments at their
+    starts by the rotations there.
+
+    Across spans there is a force beside the motion, $\phi$ (see `spans`): columns of its own."""
+    last = -1 - arms
+    if spans is not None:
+        step = step._replace(moved=_with_force(step.moved), pushed=_with_force(step.pushed))
+    L, U, signs, moved, pushed, by_wrench = step
     width = moved.shape[1]
     given = jnp.concatenate([L, moved], axis=1), U, signs, pushed, by_wrench
+    given, spans = jax.tree.map(lambda x: jnp.moveaxis(x, last, 0), (given, spans))
 
-    def backward(beyond: Array, step: tuple) -> tuple[Array, tuple]:
-        ahead, U, signs, pushed, G = step
-        Q, q = columns(beyond, 0, 6), columns(beyond, 6, width)
-        change = once(product(Q, ahead) + jnp.pad(q, [(0, 0), (12, 0)]))
+    def backward(beyond: tuple, now: tuple) -> tuple[tuple, tuple]:
+        (ahead, U, signs, pushed, G), span = now
+        if span is not None:
+            beyond = span.closing(*beyond)
+        wrench, ends = beyond
+        others = _padded(columns(wrench, 6, width), 12)
+        change = once(product(columns(wrench, 0, 6), ahead) + others)
         by_slide, W = columns(change, 0, 6), columns(change, 6, 6 + width)
         reduced = matmul(U, change)
         y, negative = _solved_for(signs, columns(reduced, 0, 6), columns(reduced, 6, 6 + width))
         W = once(W + product(by_slide, y))
         start = once(pushed + product(G, W))
-        return start, (y, W, negative, columns(rows(start, 0, 3), 0, 3))
+        if span is not None:
+            end = once(columns(ahead, 6, 6 + width) + product(columns(ahead, 0, 6), y))
+            ends = product(columns(ends, 0, 6), end) + _padded(columns(ends, 6, width), 6)
+            start, ends = span.opening(start, once(ends))
+        return (start, ends), (y, W, negative, columns(rows(start, 0, 3), 0, 3))
 
-    none = jnp.zeros(moved.shape[:2], moved.dtype)
-    steps = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), given)
-    _, (y, W, negative, Q) = scan(backward, none, steps, reverse=True)
-    y, W, Q = (jnp.moveaxis(x, 0, -1) for x in (y, W, Q))
-    ends = once(moved + product(L, y))
+    none = jnp.zeros_like(given[3][0])
+    tip = none, None if spans is None else none
+    _, (y, W, negative, Q) = scan(backward, tip, (given, spans), reverse=True)
+    y, W, Q = (jnp.moveaxis(x, 0, last) for x in (y, W, Q))
+    ends = jnp.moveaxis(once(moved + product(L, y)), last, 0)
 
-    def forward(z: Array, end: Array) -> tuple[Array, Array]:
-        return affine(end, z), z
+    def forward(base: tuple, now: tuple) -> tuple[tuple, Array]:
+        (end, span), (z, force) = now, base
+        if span is None:
+            return (affine(end, z), None), z
+        force = span.force(z, force)
+        both = jnp.concatenate([z, force])
+        return (affine(end, both), force), both
 
-    _, z = scan(forward, columns(none, 6, width), jnp.moveaxis(ends, -1, 0))
-    z = jnp.moveaxis(z, 0, -1)
-    return z, affine(y, z), affine(W, z), negative, Q
+    still = jnp.zeros_like(none[:, (6 if spans is None else 12) :])
+    base = still, None if spans is None else still
+    z = jnp.moveaxis(scan(forward, base, (ends, spans))[1], 0, last)
+    negative = jnp.moveaxis(negative, 0, last)
+    return rows(z, 0, 6), affine(y, z), affine(W, z), negative, Q
+
+
+def _with_force(x: Array) -> Array:
+    """A matrix with columns of a force across spans, zero, between those of motions and those of
+    right sides."""
+    motion, sides = columns(x, 0, 6), columns(x, 6, x.shape[1])
+    return jnp.concatenate([motion, jnp.zeros_like(motion), sides], axis=1)
+
+
+def _padded(x: Array, before: int) -> Array:
+    """A matrix with so many columns of zeros before its own."""
+    return jnp.pad(x, [(0, 0), (before, 0), *[(0, 0)] * (x.ndim - 2)])
 
 
 def _solved_for(signs: Array, by_itself: Array, right: Array) -> tuple[Array, Array]:
     """Solution y of $S y = A y + b$, and the negative eigenvalues of S - A less those of S."""
-    rest = jnp.eye(6, dtype=right.dtype) * signs - by_itself
+    one = jnp.eye(6, dtype=right.dtype).reshape(6, 6, *(1,) * (right.ndim - 2))
+    rest = one * signs - by_itself
     (a, b), (d, e) = ((columns(half, 0, 3), columns(half, 3, 6)) for half in halves(rest))
     y, negative, _ = solved(((a, b), (d, e)), halves(right), a, tuple(range(6)))
-    return jnp.concatenate(y), negative - jnp.sum(signs < 0, dtype=jnp.int32)
+    return jnp.concatenate(y), negative - jnp.sum(signs < 0, axis=0, dtype=jnp.int32)
 
 
 def _factors(F: Array) -> tuple[Array, Array, Array, Array]:

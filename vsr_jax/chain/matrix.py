@@ -27,6 +27,8 @@ from .coupled import Coupled
 from .definiteness import UNSTABLE_SECTION, Definiteness, definiteness
 from .hinge_passes import multiplied_by_hinges, solved_by_hinges, solved_by_joints
 from .hinges import Hinge, hinges_of
+from .nodes import whole
+from .spans import Spans, SpanStiffness
 from .step_passes import changes_by_steps, solved_by_steps, step_nodes
 
 
@@ -69,9 +71,13 @@ class Chain(NamedTuple):
         # step without what lies beyond it is indefinite
         limp = push is not None and b.dtype == jnp.float32
         by_nodes = apart or b.ndim > 4 or limp
+        by_nodes = by_nodes and coupled.spans is None
         hinges = self._hinges(coupled, b, push, 0 if by_nodes else 6)
-        passed = solved_by_hinges if by_nodes else solved_by_joints
-        strain, negative, asymmetry = passed(hinges, self.grid, self.free)
+        if by_nodes:
+            found = solved_by_hinges(hinges, self.grid, self.free)
+        else:
+            found = solved_by_joints(hinges, self.grid, self.free, self._spans(coupled, b))
+        strain, negative, asymmetry = found
         found = self._free_part(self._turned(transpose(coupled.rotation), strain))
         return found, definiteness(negative, asymmetry, self.grid)
 
@@ -85,7 +91,7 @@ class Chain(NamedTuple):
         world, back = self._turned(coupled.rotation, change), transpose(coupled.rotation)
         if coupled.motion == 6:
             hinges = self._hinges(coupled, jnp.zeros_like(change), None, 0)
-            wrench = multiplied_by_hinges(hinges, world, self.grid)
+            wrench = multiplied_by_hinges(hinges, world, self.grid, self._spans(coupled, change))
             return c.times(self.flexible, self._free_part(self._turned(back, wrench)))
         nodes = step_nodes(H, change[:, 0], coupled, self.grid, self.flexible)
         moved = jax.vmap(lambda x: changes_by_steps(nodes, x, self.grid), 1, 1)(world)
@@ -150,6 +156,16 @@ class Chain(NamedTuple):
     def _hinges(self, coupled: Coupled, b: Array, push: Array | None, unknowns: int) -> Hinge:
         H, linear = c.symmetric(self.stiffness), max(self.free) > 2
         return hinges_of(H, b, coupled, self.grid, self.flexible, push, unknowns, linear=linear)
+
+    def _spans(self, coupled: Coupled, like: Array) -> SpanStiffness | None:
+        """The stiffness across spans about the hinges, for arrays `like` the right sides."""
+        if coupled.spans is None:
+            return None
+        shape = like.shape[2:]
+        reach = 0.5 * whole(self.grid.weight, shape) * whole(coupled.axis, shape)
+        start, end = (jnp.broadcast_to(x, (*x.shape[:2], *shape[1:])) for x in coupled.spans[:2])
+        opens = jnp.broadcast_to(coupled.spans.opens, shape[1:])
+        return Spans(start, end, opens).stiffness(reach[:, 0])
 
     def _sides(self, right: Vector, push: Array | None) -> tuple[Array, Array | None]:
         """Right sides as arrays (6, sides, stages, steps, *arms)."""

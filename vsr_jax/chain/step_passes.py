@@ -32,7 +32,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..numerics import component as c
 from ..numerics.component import Matrix, Tree
 from ..numerics.loops import scan
 from ..numerics.once import once
@@ -74,12 +73,11 @@ def changes_by_steps(nodes: StepNodes, strain: Array, grid: Grid) -> Array:
         kappa, h, stages = rows(change, 0, 3), node.h, change.shape[1]
         turns = theta[:, None] + h * weighted(collocation(stages), kappa, 1)
         end = theta + h * weighted(gauss_legendre(stages)[1], kappa, 1)
-        return c.times(node.joined, end), (turns, end)
+        return end, (turns, end)
 
     def backward(beyond: Array, step: tuple) -> tuple[Array, Array]:
         (turns, end), place = step
         node, change = own(place)
-        beyond = c.times(node.joined, beyond)
         if node.jump is not None:
             beyond = beyond + matvec(node.jump, end)
         moment, force = (rows(beyond, i, i + 3)[:, None] for i in (0, 3))
@@ -120,17 +118,17 @@ def _step_by_step(
         return rows(x, 0, 3), rows(x, 3, 3 + size)
 
     def backward(end: tuple, step: tuple) -> tuple[tuple, tuple]:
-        maps, given, jump, cut = jax.tree.map(once, step)
-        start, (joint, negative) = join(end, Link(*parted(maps), *parted(given), jump, cut))
+        maps, given, jump = jax.tree.map(once, step)
+        start, (joint, negative) = join(end, Link(*parted(maps), *parted(given), jump))
         maps = jnp.concatenate([joint.turn, joint.wrench, rows(start[0], 0, 3)])
         return start, (maps, jnp.concatenate([joint.turned, joint.pulled]), negative)
 
-    steps = _moved((maps, given, link.jump, link.joined), -1, 0)
+    steps = _moved((maps, given, link.jump), -1, 0)
     _, (maps, given, negative) = scan(backward, end, steps, reverse=True)
     maps, given = _moved((maps, given), 0, -1)
     (turn, wrench), (turned_end, pulled) = parted(maps), parted(given)
     joint = Joint(turn, turned_end, wrench, pulled)
-    theta = _rotations(*_moved((turn, turned_end, link.joined), -1, 0))
+    theta = _rotations(*_moved((turn, turned_end), -1, 0))
     asymmetry = step.asymmetry(rows(maps, 3 + size, 6 + size))
     signs = negative + local, stable, asymmetry
     return by_start(nodes, sections, step, joint), theta, signs
@@ -152,20 +150,19 @@ def _node_by_node(
         return start, (strain, joint.turn, joint.turned, signs)
 
     _, (strain, turn, turned_end, signs) = scan(backward, end, places, reverse=True)
-    joined = None if nodes.joined is None else nodes.joined[places]
-    theta = _rotations(turn, turned_end, joined)
+    theta = _rotations(turn, turned_end)
     return _moved(strain, 0, last), theta, signs
 
 
-def _rotations(turn: Array, more: Array, joined: Array | None) -> Array:
+def _rotations(turn: Array, more: Array) -> Array:
     """Rotations at the starts of the steps, from the base on."""
     none = jnp.zeros(more.shape[1:], more.dtype)
 
     def forward(theta: Array, step: tuple) -> tuple[Array, Array]:
-        turn, more, joined = jax.tree.map(once, step)
-        return c.times(joined, matvec(turn, theta) + more), theta
+        turn, more = jax.tree.map(once, step)
+        return matvec(turn, theta) + more, theta
 
-    return scan(forward, none, (turn, more, joined))[1]
+    return scan(forward, none, (turn, more))[1]
 
 
 def step_nodes(
@@ -193,26 +190,22 @@ def step_nodes(
         None if coupled.density is None else all_of(coupled.density),
         at_ends(coupled.ends),
         None if flexible is None else all_of(flexible),
-        at_ends(coupled.joined),
     )
 
 
 def _apart(nodes: StepNodes, grid: Grid) -> StepNodes:
     """Each node as a step of its own, whose length is its weight."""
-    stages, jump, joined = grid.X.shape[0], nodes.jump, nodes.joined
+    stages, jump = grid.X.shape[0], nodes.jump
     return nodes._replace(
         h=jnp.broadcast_to(grid.weight, nodes.axis.shape[1:]),
         jump=None if jump is None else at_last_nodes(jump, stages),
-        joined=None
-        if joined is None
-        else 1.0 - at_last_nodes(1.0 - joined[None, None], stages)[0, 0],
     )
 
 
 def _alone(node: StepNodes, last: int) -> StepNodes:
     """A step of one node, with the axis of nodes in the place before the last axes."""
     step = jax.tree.map(lambda x: jnp.expand_dims(x, last), node)
-    return step._replace(h=node.h, jump=node.jump, joined=node.joined)
+    return step._replace(h=node.h, jump=node.jump)
 
 
 def _moved(tree: Tree, source: int, destination: int) -> Tree:

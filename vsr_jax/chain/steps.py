@@ -33,8 +33,8 @@ class StepNodes(NamedTuple):
     of the loads at the end of the step by rotations, None where there are none; `flexible` of the
     sections.
 
-    Behind the components come the axis of the nodes (but for h, `jump` and `joined`) and those of
-    steps or arms.
+    Behind the components come the axis of the nodes (but for h and `jump`) and those of steps or
+    arms.
     """
 
     h: Array
@@ -49,7 +49,6 @@ class StepNodes(NamedTuple):
     slope: Array | None
     jump: Array | None
     flexible: Array | None
-    joined: Array | None
 
 
 class Sections(NamedTuple):
@@ -74,7 +73,6 @@ class Link(NamedTuple):
     - `turn` (3, columns), `turned`: rotation at the end.
     - `start` (wrench, columns), `started`: change of the wrench at the start.
     - `jump` (6, 3): derivative of the loads at the end by their rotation, None without such loads.
-    - `joined`: 0 where the arm is cut at the end, 1 where it is not; None without cuts.
     """
 
     turn: Array
@@ -82,7 +80,6 @@ class Link(NamedTuple):
     turned: Array
     started: Array
     jump: Array | None
-    joined: Array | None
 
 
 class Condensed(NamedTuple):
@@ -137,7 +134,7 @@ def condensed(node: StepNodes, free: tuple[int, ...]) -> tuple[Sections, Condens
     started = total(matvec(turning, bent), 1)
     started = jnp.concatenate([rows(started, 0, 3) + density[:, stages], started[3:]])
     before = h * weighted(collocation(stages)[0], rows(node.density, 0, 3), 1)
-    link = Link(turn, start, h * weighted(weights, bent, 1), started, node.jump, node.joined)
+    link = Link(turn, start, h * weighted(weights, bent, 1), started, node.jump)
     moment = node.wrench[:3, 0] + before
     step = Condensed(link, X, bent, moment, sections.compliance[:, :, 0])
     return sections, step, negative, stable
@@ -239,8 +236,6 @@ def join(end: tuple[Array, Array], step: Link) -> tuple[tuple[Array, Array], tup
     """One step, from P and p at its end to those at its start; its `Joint` and the number of
     negative pivots."""
     P, p = end
-    if step.joined is not None:
-        P, p = step.joined * P, step.joined * p
     if step.jump is not None:
         P = P + step.jump
     by_end = columns(step.turn, 3, step.turn.shape[1])

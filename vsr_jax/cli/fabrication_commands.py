@@ -63,7 +63,7 @@ def add_export(commands: Commands) -> None:
         metavar="X",
         nargs="+",
         type=float,
-        help="abscissas in metres of the discs to drill (default: those of the tendons, or 11)",
+        help="abscissas in metres of the discs to drill (default: those of the arm, or 11)",
     )
     parser.add_argument(
         "--chord",

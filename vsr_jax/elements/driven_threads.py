@@ -155,7 +155,7 @@ class DrivenThreads(ThreadRule):
     def _length(self, place: int, at: ArmState, problem: ArmProblem) -> Array:
         pull = pull_on(at.exerted, place)
         if pull is not None:
-            return pull.length(place)
+            return pull.path_length(place)
         return path_length(at.xi, problem.sections, place, problem.grid)
 
     def _wrenches(self, at: ArmState, problem: ArmProblem) -> tuple[list[Vector], list[Vector]]:
@@ -170,9 +170,9 @@ class DrivenThreads(ThreadRule):
                 pulls.append(c.times(at.carried.gains[place], wrench))
                 lengths.append(c.times(problem.sections.reach[place], wrench))
             else:
-                wrench = pull.unit(place, at.along.pose.rotation)
-                pulls.append(wrench)
-                lengths.append(wrench)
+                rotation = at.along.pose.rotation
+                pulls.append(pull.unit(place, rotation, at.carried.gains[place]))
+                lengths.append(pull.unit(place, rotation))
         return pulls, lengths
 
     def residual(
@@ -252,7 +252,7 @@ def thread_length(
     chords."""
     if not scene.actuators[place].straight:
         return path_length(xi, sections, place, grid)
-    return chords_of(scene, xi, grid).length(place)
+    return chords_of(scene, xi, grid).path_length(place)
 
 
 def path_length(xi: Vector, sections: CrossSections, place: int, grid: Grid) -> Array:

@@ -65,7 +65,7 @@ class FollowerDensity(_Follower):
         density = turned(pose.rotation, self.density)
         return Exerted(beyond(density, pose.grid), density, note=density)
 
-    def slopes(self, pose: Pose, exerted: Exerted, size: int, *, alone: bool) -> Slopes:
+    def slopes(self, pose: Pose, exerted: Exerted, size: int) -> Slopes:
         return Slopes(density=_turning(exerted.note, size))
 
     def sizes(self, length: Array, base: Array | None, motion: int) -> list[Array]:
@@ -90,7 +90,7 @@ class FollowerPoint(_Follower):
         wrench = turned(pose.rotation_at(self.step), self.wrench)
         return Exerted(self.before * wrench[:, None, None], note=wrench)
 
-    def slopes(self, pose: Pose, exerted: Exerted, size: int, *, alone: bool) -> Slopes:
+    def slopes(self, pose: Pose, exerted: Exerted, size: int) -> Slopes:
         return Slopes(ends=at_end(self.step, _turning(exerted.note, size), pose.grid))
 
     def sizes(self, length: Array, base: Array | None, motion: int) -> list[Array]:

@@ -238,16 +238,17 @@ def _rows(
 
 
 def friction_of(scene: Scene, grid: Grid) -> Friction | None:
-    """The friction of a scene's tendons on a grid; None without."""
-    places = scene.frictional
+    """The friction of a scene's tendons along their paths on a grid; None without."""
+    places = tuple(i for i in scene.frictional if i not in scene.straight)
     if not places:
         return None
     _, rate = jax.jvp(scene.sections, (grid.X,), (jnp.ones_like(grid.X),))
-    coefficients = tuple(_coefficient(scene, place) for place in places)
+    coefficients = tuple(coefficient_of(scene, place) for place in places)
     return Friction(places, coefficients, rate, breaks_of(scene.breakpoints, grid))
 
 
-def _coefficient(scene: Scene, place: int) -> Array:
+def coefficient_of(scene: Scene, place: int) -> Array:
+    """Coefficient of friction of a thread, positive for pull."""
     friction = scene.actuators[place].signed_friction
     assert friction is not None  # see Scene.frictional
     return friction

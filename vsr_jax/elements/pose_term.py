@@ -66,7 +66,7 @@ class PoseTerm(AppliedLoad):
             return Exerted(beyond(here, pose.grid), here, note=section)
         return Exerted(self.before * here[:, None, None], note=section)
 
-    def slopes(self, pose: Pose, exerted: Exerted, size: int, *, alone: bool) -> Slopes:
+    def slopes(self, pose: Pose, exerted: Exerted, size: int) -> Slopes:
         rotation, position = exerted.note
         here = self.slope(rotation, position, size)
         if self.step is None:

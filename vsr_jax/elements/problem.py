@@ -6,11 +6,12 @@ from ..arm.scene import Scene
 from ..mechanics.applied_load import AppliedLoad, Loading
 from ..mechanics.coupling import ArmProblem, Coupling
 from ..numerics.quadrature import Grid
-from .chords import discs_of
+from .chords import straight_tendons_of
 from .contact import contacts_of
 from .driven_threads import driven_threads_of
 from .fixed_loads import fixed_loads
 from .friction import friction_of
+from .hole_friction import hole_friction_of
 from .pose_term import pose_terms
 from .supports import supports_of
 
@@ -21,6 +22,7 @@ def problem_of(scene: Scene, inputs: Array, grid: Grid) -> ArmProblem:
     found: tuple[Coupling | None, ...] = (
         driven_threads_of(scene, inputs, sections, grid),
         friction_of(scene, grid),
+        hole_friction_of(scene, grid),
         supports_of(scene, sections, grid),
         contacts_of(scene, sections, grid),
     )
@@ -33,5 +35,5 @@ def loading(scene: Scene, grid: Grid) -> Loading | None:
     if not scene.reacts:
         return None
     loads: tuple[AppliedLoad, ...] = (*fixed_loads(scene, grid), *pose_terms(scene, grid))
-    discs = discs_of(scene, grid)
-    return Loading(loads if discs is None else (*loads, discs), scene.rod.frame)
+    tendons = straight_tendons_of(scene, grid)
+    return Loading(loads if tendons is None else (*loads, tendons), scene.rod.frame)

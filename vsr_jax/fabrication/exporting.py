@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..arm.discs import distinct_discs
 from ..arm.scene import Scene
+from ..arm.thread_lines import hole_places
 from ..numerics.compiling import program
 from ..numerics.component import norm
 from ..solution.equilibrium import Equilibrium
@@ -36,7 +36,7 @@ TOLERANCE = 2e-5
 """Default distance [m] of chords from the shape."""
 
 _DISCS = 11
-"""Number of discs of the drilling plan where tendons have none."""
+"""Number of discs of the drilling plan where the arm has none."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ def export(
     - `wall`: thickness [m] of walls below which there is a warning. Walls are measured in the
       exported shape.
     - `discs`: number of discs, evenly spaced from base to tip, or their abscissas [m]; by default
-      those of the straight tendons and their ends, or 11 even ones where there are none.
+      the base and the rod's discs, or 11 even ones where it has none.
     - `tolerance`: distance [m] of chords from the shape; sets the number of stations and of corners
       around.
 
@@ -231,8 +231,8 @@ def _given_bores(scene: Scene, bore: ArrayLike | None) -> Float[np.ndarray, " th
 def _places(scene: Scene, discs: VectorLike | None) -> Float[np.ndarray, " discs"]:
     length = float(scene.rod.length)
     if discs is None:
-        X = distinct_discs(scene.rod, scene.actuators)
-        return X if X.size else np.linspace(0.0, length, _DISCS)
+        without = scene.rod.discs is None
+        return np.linspace(0.0, length, _DISCS) if without else np.asarray(hole_places(scene.rod))
     if isinstance(discs, int | np.integer):
         return np.linspace(0.0, length, count("discs", discs, least=2))
     X = np.asarray(numbers("discs", discs, None), float)

@@ -3,7 +3,7 @@ constructor by name.
 
 The top level of a file contains the arguments of `Scene` and, optionally, a `title` and `inputs`.
 Units are those of the constructors. The type is optional where only one class is possible (`rod`,
-`material`, `rigid`). A profile can be a plain number.
+`material`, `discs`, `rigid`). A profile can be a plain number.
 
 A new class needs an entry in its group below and a field for each argument of its constructor, of
 the same name. An argument without a field is read but not written, as `diameter` of `Circular`.
@@ -22,6 +22,7 @@ import tomli_w
 from jaxtyping import Array, Float
 
 from ..arm.actuator import Chamber, Tendon, Thread
+from ..arm.discs import Discs
 from ..arm.fields import arguments
 from ..arm.held import Held
 from ..arm.loads import DistributedWrench, Gravity, PointWrench, TipWrench
@@ -53,6 +54,7 @@ _PROFILES = _group(Constant, Taper, PolynomialProfile, SplineProfile, Piecewise)
 _SECTIONS = _group(Circular, Annular, Rectangular, Elliptic, Joined)
 _GROUPS = {
     "rod": _group(Rod),
+    "discs": _group(Discs),
     "rigid": _group(RigidPiece),
     "material": _group(Material),
     "section": _SECTIONS,

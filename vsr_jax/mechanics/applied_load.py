@@ -4,14 +4,15 @@ All arrays of one arm have the arms of a batch in further axes at their end.
 """
 
 from abc import abstractmethod
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..numerics.component import Forces, Vector
+from ..chain import Spans
+from ..numerics.component import Forces
 from ..numerics.quadrature import Grid, before, sum_along
 from ..numerics.se3 import base_pose
 
@@ -70,11 +71,11 @@ class Exerted(NamedTuple):
 
 class Slopes(NamedTuple):
     """How a load changes with the motions of the sections, for `Coupled`: `density`, `ends` and
-    `joined` there; None where nothing changes."""
+    `spans` there; None where nothing changes."""
 
     density: Array | None = None
     ends: Array | None = None
-    joined: Array | None = None
+    spans: Spans | None = None
 
 
 class AppliedLoad(eqx.Module):
@@ -83,11 +84,7 @@ class AppliedLoad(eqx.Module):
     - `conservative`: whether it has a potential.
     - `motion`: size of the motions of sections by which it changes: 0 for a dead load, 3 (rotation)
       or 6 (and displacement).
-    - `local`: whether it acts only between sections that it joins: without other loads the arm can
-      be cut between those.
     """
-
-    local: ClassVar[bool] = False
 
     @property
     def conservative(self) -> Array | bool:
@@ -114,16 +111,9 @@ class AppliedLoad(eqx.Module):
     def exerted(self, pose: Pose) -> Exerted:
         """What it exerts."""
 
-    def slopes(self, pose: Pose, exerted: Exerted, size: int, *, alone: bool) -> Slopes:
-        """Its derivatives by motions of a `size`; `alone`: all loads of the arm are `local`. None
-        by default, of a dead load."""
+    def slopes(self, pose: Pose, exerted: Exerted, size: int) -> Slopes:
+        """Its derivatives by motions of a `size`. None by default, of a dead load."""
         return Slopes()
-
-    def spans(self, pose: Pose, exerted: Exerted, *, alone: bool) -> Vector | None:
-        r"""Wrenches $w_j$ on the nodes, in their frames, for which its stiffness across spans of
-        the arm adds $\sum_j w_j w_j^T$ to the tangent: component arrays (spans, stages, steps);
-        none by default."""
-        return None
 
     def within_step(
         self, exerted: Exerted, step: Array, sigma: Array, *, smooth: bool
@@ -153,16 +143,6 @@ class Loading(NamedTuple):
         return self._replace(loads=others) if others else None
 
     @property
-    def local(self) -> bool:
-        """Whether all loads are."""
-        return all(load.local for load in self.loads)
-
-    @property
-    def spans(self) -> bool:
-        """Whether some loads act across spans of an arm that others bend too."""
-        return any(load.local for load in self.loads) and not self.local
-
-    @property
     def motion(self) -> int:
         """Size of the motions of sections by which the loads change."""
         return max((load.motion for load in self.loads), default=0)
@@ -185,6 +165,15 @@ class Loading(NamedTuple):
         elsewhere = self.threads
         return tuple(
             jnp.zeros_like(force) if i in elsewhere else force for i, force in enumerate(tau)
+        )
+
+    def along_chords(self, forces: Forces, shares: tuple[Array | None, ...]) -> Forces:
+        """Forces of the threads at their start, but of those that do not run along the sections in
+        each step: times their share at its first node."""
+        elsewhere = self.threads
+        return tuple(
+            force if share is None or i not in elsewhere else force * share[0]
+            for i, (force, share) in enumerate(zip(forces, shares, strict=True))
         )
 
     def scaled(self, share: Array) -> "Loading":

@@ -76,7 +76,7 @@ def state_of(xi: Vector, coupled: tuple[PyTree, ...], problem: ArmProblem) -> Ar
     along, by_couplings = None, loads_of(couplings, coupled)
     if loads is not None:
         loads = loads.having(tuple(load for own in by_couplings for load in own))
-        along = react(xi, grid, loads, forces)
+        along = react(xi, grid, loads, loads.along_chords(forces, carried.shares))
     at = ArmState(xi, carried, tau, loads, along, ())
     first, notes = len(at.exerted) - sum(map(len, by_couplings)), []
     for coupling, x, own in zip(couplings, coupled, by_couplings, strict=True):

@@ -266,9 +266,9 @@ def _solve(
 ) -> Root:
     arms = arms_in((origin, guess, whole), whole.grid.h.ndim - 1)
     given = whole, origin, guess, jnp.broadcast_to(rounding_of(whole), arms)
-    side = lanes(arms[0], _UNEVEN if _uneven(whole) else TOGETHER) if arms else 0
+    side = lanes(arms[0], _UNEVEN if whole.constrained else TOGETHER) if arms else 0
     if arms and known(arms[0]) and side < arms[0]:
-        slow = side - 1 if _uneven(whole) else int(_SLOW * side)
+        slow = side - 1 if whole.constrained else int(_SLOW * side)
         root = queued(partial(_iteration, free, (side,)), given, arms[0], side, slow)
     else:
         root = iterated(_iteration(free, arms, given))
@@ -280,11 +280,6 @@ def _solve(
     imbalance = imbalance_of(root.x, at, whole, free)
     _, definite, _ = approximate_solve(root.x, at, imbalance, whole, free, symmetric=True)
     return root._replace(definite=definite)
-
-
-def _uneven(problem: ArmProblem) -> bool:
-    """Whether some arms of a batch may need several times as many steps as most."""
-    return problem.constrained or (problem.loads is not None and problem.loads.spans)
 
 
 def _iteration(

@@ -11,8 +11,8 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
-from ..chain import Border, Chain, Definiteness, bordered_solve, with_spans
-from ..chain.spans import Solve, solve_both
+from ..chain import Border, Chain, Definiteness, bordered_solve, solved_with
+from ..chain.border import Solve
 from ..numerics import component as c
 from ..numerics.component import Vector, free_components, spread
 from ..numerics.loops import while_loop
@@ -51,15 +51,14 @@ def approximate_solve(
     and whether that is doubtful.
 
     In single precision: the passes along the arm are bound by memory, and rounding is far below the
-    error of the elimination. Two keep the precision of the unknowns: constraints, since an arm may
-    be a million times as stiff along its axis as across, and loads across spans, without whose own
-    stiffness, which is added last, the tangent may be singular.
+    error of the elimination. Constraints keep the precision of the unknowns, since an arm may be a
+    million times as stiff along its axis as across.
 
     **Arguments:** `symmetric`: with the contact forces that friction follows held; `apart`: solve
     for `right` apart from all that does not depend on it, in place of one pass for everything, so
     that derivatives by `right` repeat only the former.
     """
-    if not (problem.constrained or (at.loads is not None and at.loads.spans)):
+    if not problem.constrained:
         unknown, at, right, problem, damping = c.single(
             (unknown, at, right, problem, jnp.asarray(damping))
         )
@@ -80,7 +79,7 @@ def approximate_solve(
         pushes.append(push)
     pushes = [sum(pushes[1:], pushes[0])] if pushes else []
     chain = Chain(lower, free, sections.flexible, coupled, grid)
-    solve = _with_spans(partial(chain.solve, apart=apart), at, apart=apart)
+    solve = partial(chain.solve, apart=apart)
     borders = borders_of(problem, unknown.coupled, at)
     conservative = loads is None or loads.conservative
     strain, changes, (negative, doubtful) = _bordered(
@@ -91,18 +90,6 @@ def approximate_solve(
         for place, one in springs.items():
             strain, changes[place] = one.followed(strain, changes[place], motions)
     return ArmUnknown(strain, tuple(changes)), negative == 0, doubtful
-
-
-def _with_spans(solve: Solve, at: ArmState, *, apart: bool) -> Solve:
-    """The solution with the stiffness across spans that loads have."""
-    along, loads = at.along, at.loads
-    if along is None or loads is None:
-        return solve
-    for load, exerted in zip(loads.loads, along.exerted, strict=True):
-        spans = load.spans(along.pose, exerted, alone=loads.local)
-        if spans is not None:
-            solve = with_spans(solve, spans, along.pose.grid, loads.conservative, apart=apart)
-    return solve
 
 
 def _bordered(
@@ -123,7 +110,7 @@ def _bordered(
     if border is None:
         found, definiteness = solve(*sides)
         return tuple(x[0] for x in found), coupled, definiteness
-    found, answers, definiteness = solve_both(solve, sides, border.columns, apart=apart)
+    found, answers, definiteness = solved_with(solve, sides, border.columns, apart=apart)
     right = jnp.concatenate([rows[place] for place in places])
     strain, x, held = bordered_solve(tuple(x[0] for x in found), answers, right, border, grid)
     first = 0

@@ -67,11 +67,12 @@ class Reaction(NamedTuple):
 
     def coupled(self, loading: Loading) -> Coupled:
         """How the sections act on each other by the loads."""
-        pose, size, alone = self.pose, loading.motion, loading.local
+        pose, size = self.pose, loading.motion
         each = [
-            load.slopes(pose, exerted, size, alone=alone)
+            load.slopes(pose, exerted, size)
             for load, exerted in zip(loading.loads, self.exerted, strict=True)
         ]
+        spans = [one.spans for one in each if one.spans is not None]
         return Coupled(
             pose.rotation,
             pose.axis,
@@ -79,7 +80,7 @@ class Reaction(NamedTuple):
             self.density,
             density=_sum([one.density for one in each]),
             ends=_sum([one.ends for one in each]),
-            joined=_sum([one.joined for one in each]),
+            spans=spans[0] if spans else None,
         )
 
 

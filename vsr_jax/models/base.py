@@ -11,7 +11,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..arm.discs import shared_discs
 from ..arm.scene import CrossSections, Scene, shared, together
 from ..elements.problem import loading, problem_of
 from ..mechanics.applied_load import Loading
@@ -200,9 +199,9 @@ class Model(eqx.Module):
         which only the balance of the whole arm by `StrainDependent` has."""
         if scene.straight:
             raise ValueError(
-                f"scene.actuators[{scene.straight[0]}].discs: got a tendon that runs straight from "
-                f"disc to disc and {type(self).__name__}, need StrainDependent, the model for such "
-                f"tendons"
+                f"scene.actuators[{scene.straight[0]}].straight: got a tendon that runs straight "
+                f"from disc to disc and {type(self).__name__}, need StrainDependent, the model for "
+                f"such tendons"
             )
         found = "held sections" if scene.held else "obstacles" if scene.obstacles else None
         if found:
@@ -272,11 +271,7 @@ class SteppedModel(Model):
         return self._grid(scene, self.steps, self.order // 2)
 
     def _grid(self, scene: Scene, steps: int, stages: int) -> Grid:
-        """Pieces that are empty since tendons share discs have steps of their own, not some of
-        `steps`."""
-        edges = scene.edges(self.breakpoints(scene))
-        more = shared_discs(scene.rod, scene.actuators)
-        return make_grid(edges, steps + more, stages)
+        return make_grid(scene.edges(self.breakpoints(scene)), steps, stages)
 
     def tip(self, scene: Scene, forces: Forces, state: Any) -> Pose:
         return tip_pose(self.node_strain(scene, state), self.grid(scene).h, scene.rod.frame)

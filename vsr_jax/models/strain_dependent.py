@@ -46,7 +46,7 @@ class StrainDependent(SteppedModel):
 
     **Arguments:**
     - `steps`: steps along the arm, at least one on each smooth piece, the others distributed by
-      length. Further ones are added where several tendons run through the same discs.
+      length.
     - `order`: order of the steps, 2, 4 (Zanna's, eq. 5) or 6, with one, two or three nodes per
       step.
     """
@@ -231,9 +231,10 @@ class StrainDependent(SteppedModel):
     ) -> Vector:
         grid = self.grid(scene)
         loads = self.loading(scene, state, grid)
-        reaction = (
-            None if loads is None else react_at(state.xi, grid, loads, X, forces, smooth=smooth)
-        )
+        reaction = None
+        if loads is not None:
+            chords = loads.along_chords(forces, state.shares_at(scene, grid, grid.X, forces))
+            reaction = react_at(state.xi, grid, loads, X, chords, smooth=smooth)
         tau = shared(forces, state.shares_at(scene, grid, X, forces))
         tau = tau if loads is None else loads.along_sections(tau)
         start = tuple(jnp.interp(X, grid.X.T.reshape(-1), x.T.reshape(-1)) for x in state.xi)

@@ -65,7 +65,8 @@ def energy_of(
         if i in driven:
             cables = cables + _stretch(scene, inputs, forces, nodes, i)
         elif i in scene.straight:
-            actuation -= forces[i] * chords_of(scene, nodes.xi, nodes.grid).length(i)
+            chords = chords_of(scene, nodes.xi, nodes.grid)
+            actuation -= forces[i] * chords.path_length(i, nodes.shares[i])
         else:
             actuation -= jnp.sum(weight * tau[i] * thread_direction(nodes.xi, path)[1])
     return Energy(elastic, cables, actuation, _of_loads(scene, nodes, poses))

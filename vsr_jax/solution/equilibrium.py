@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ..arm.discs import on_chords, points_at
 from ..arm.scene import Scene
+from ..arm.thread_lines import hole_places, on_chords, points_at
 from ..elements.driven_threads import driven_of, thread_length
 from ..mechanics.arm_balance import ArmUnknown
 from ..mechanics.balance import forces_where
@@ -343,7 +343,7 @@ class Equilibrium(Solved):
         def place(x: Array) -> Array:
             if not actuator.straight:
                 return points_at(actuator, x, self.pose(x))
-            holes = actuator.holes(self.scene.rod.length)
+            holes = hole_places(self.scene.rod)
             return on_chords(points_at(actuator, holes, self.pose(holes)), holes, x)
 
         return masked_along(self, X, place, self._ends(index))

@@ -17,7 +17,6 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from ..arm.discs import shared_discs
 from ..arm.scene import Scene
 from ..mechanics.balance import forces_where
 from ..models.base import Status, resolved
@@ -250,8 +249,7 @@ class _Trial(StrainDependent):
         self.wanted = wanted
 
     def grid(self, scene: Scene) -> Grid:
-        more = shared_discs(scene.rod, scene.actuators)
-        return make_grid(scene.edges(), self.wanted + more, self.order // 2, room=self.steps + more)
+        return make_grid(scene.edges(), self.wanted, self.order // 2, room=self.steps)
 
 
 def _tip_of(scene: Scene, inputs: Array, model: StrainDependent) -> tuple[Array, Array]:

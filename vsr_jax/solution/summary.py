@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..arm.discs import on_chords, points_at
+from ..arm.thread_lines import hole_places, on_chords, points_at
 from ..numerics.compiling import program
 from ..typing import VectorLike
 from ..validation import choice
@@ -99,7 +99,7 @@ def _along(eq: Solved, X: Array) -> tuple[dict[str, Array], Array, Array]:
 def _chords(eq: Solved, place: int, X: Array) -> Array:
     """Points [m] of a straight tendon at abscissas X."""
     actuator = eq.scene.actuators[place]
-    holes = actuator.holes(eq.scene.rod.length)
+    holes = hole_places(eq.scene.rod)
     return on_chords(points_at(actuator, holes, eq.value("pose")(holes)), holes, X)
 
 

@@ -12,6 +12,7 @@ from jaxtyping import Array, PyTree
 
 from ..analysis.following import follow
 from ..arm.actuator import Tendon
+from ..arm.discs import Discs
 from ..arm.held import Held
 from ..arm.loads import Gravity, PointWrench, TipWrench
 from ..arm.material import Material
@@ -115,15 +116,18 @@ def single_scenes() -> list[EffectScene]:
     material = Material(8.0e5, poisson=0.45, density=1000.0)
     arm = Rod(0.3, Circular(0.01), material)
     tooled = Rod(0.3, Circular(0.01), material, rigid=[RigidPiece(0.25)])
+    guided_by_discs = Rod(0.3, Circular(0.01), material, discs=Discs(8))
     paths, gravity = (Helix(0.007, 1.5), Parallel(0.0, 0.007)), Gravity((0.0, 0.0, -9.81))
     tendons = [Tendon(path) for path in paths]
-    straight = [Tendon(path, discs=8) for path in paths]
+    straight = [Tendon(path, straight=True) for path in paths]
     guided = Held(position=(0.2, 0.0, -0.1), along=(1.0, 0.0, 0.0))
     touched = Scene(arm, tendons, gravity, obstacles=_pillar(-0.035))
     rough = Scene(arm, tendons, gravity, obstacles=_pillar(-0.035, friction=0.3))
     on_path = f"touched, path of {SAMPLES}"
     return [
-        EffectScene("straight tendons", Scene(arm, straight, gravity), base="+ gravity"),
+        EffectScene(
+            "straight tendons", Scene(guided_by_discs, straight, gravity), base="+ gravity"
+        ),
         EffectScene("rigid piece", Scene(tooled, tendons, gravity), base="+ gravity"),
         EffectScene("held tip", Scene(arm, tendons, gravity, held=guided), base="+ gravity"),
         EffectScene(

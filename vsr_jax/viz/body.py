@@ -14,7 +14,6 @@ from matplotlib.typing import ColorType
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 
-from ..arm.discs import disc_places, distinct_discs
 from ..arm.scene import Scene
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
@@ -23,7 +22,6 @@ from ..typing import VectorLike
 from .style import ink, shade
 from .tendons import Scales, draw_threads, is_slack, pressure_scale, tension_scale
 
-_DISCS = 13
 _ANGLES = np.linspace(0.0, 2 * np.pi, 33)
 
 _WALL, _RIGID_WALL = 0.18, 0.5
@@ -108,15 +106,15 @@ def body_of(eq: Equilibrium | Summary, stations: VectorLike = 60) -> Body:
         return Body(eq, None, None, None, np.zeros((0, 1, 3)), np.zeros(len(eq.X) - 1, bool))
     if np.ndim(eq.status) == 0 and not bool(eq.converged):
         return body_of(at_rest(eq), stations)._replace(failure=eq.message)
-    if (eq.scene.rod.rigid or eq.scene.straight) and np.ndim(eq.status) == 0:
+    if (eq.scene.rod.rigid or eq.scene.rod.discs) and np.ndim(eq.status) == 0:
         stations = with_parts(eq.scene, checked_stations(eq, stations, "stations"))
     return body_from_samples(eq, sample(eq, stations))
 
 
 def with_parts(scene: Scene, X: Float[Array, " stations"]) -> Float[Array, " more"]:
-    """Ascending stations [m], with the ends of rigid pieces and the discs of straight tendons."""
+    """Ascending stations [m], with the ends of rigid pieces and the discs."""
     parts = [x for piece in scene.rod.rigid for x in piece.breakpoints]
-    parts += disc_places(scene.rod, scene.actuators)
+    parts += [] if scene.rod.discs is None else [*scene.rod.discs.along(scene.rod.length)]
     inside = [jnp.clip(x, X[0], X[-1]) for x in parts]
     return jnp.sort(jnp.concatenate([X, jnp.stack(inside)])) if inside else X
 
@@ -147,16 +145,12 @@ def thread_scales(bodies: Sequence[Body]) -> Scales:
 
 
 def _discs(eq: Equilibrium, samples: Summary) -> np.ndarray:
-    """Rims of the discs that guide the threads: shape (discs, angles, 3). They are where straight
-    tendons have theirs, else evenly along the arm."""
-    rod, radius = eq.scene.rod, eq.scene.rod.guide_radius
-    if radius is None:
+    """Rims of the discs that guide the threads: shape (discs, angles, 3)."""
+    rod, radius = eq.scene.rod, eq.scene.rod.rim
+    if rod.discs is None or radius is None:
         return np.zeros((0, len(_ANGLES), 3))
-    places = distinct_discs(rod, eq.scene.actuators)
-    if places.size:
-        chosen = np.unique(np.argmin(np.abs(samples.X - places[:, None]), axis=1))
-    else:
-        chosen = np.unique(np.linspace(0, len(samples.X) - 1, _DISCS).astype(int))
+    places = np.asarray(rod.discs.along(rod.length))
+    chosen = np.unique(np.argmin(np.abs(samples.X - places[:, None]), axis=1))
     pose = np.asarray(samples.pose)[chosen]
     rim = float(radius) * np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])
     return pose[:, None, :3, 3] + np.einsum("dij,ja->dai", pose[:, :3, 1:3], rim)
