@@ -376,3 +376,116 @@ def test_the_weight_of_discs_is_that_of_payloads():
 def test_other_models_name_the_one_for_discs(model):
     with pytest.raises(ValueError, match=r"actuators\[0\].straight.*need StrainDependent"):
         vsr.solve(scene(discs=3), TENSIONS, model=model)
+
+
+PULLED = straight_tendons.ROBOT_CASES["6, 4 and 3 N, 0.12 N at the tip"]
+SEVERAL = 5  # discs of each section
+
+
+def rubbing(friction, motion="pull", **options):
+    """The robot of two sections, with friction in the holes of its discs."""
+    robot = straight_tendons.robot(SEVERAL).replace("loads[0].force", PULLED.force)
+    tendons = [
+        vsr.Tendon(
+            one.routing, end=one.end, straight=True, friction=friction, motion=motion, **options
+        )
+        for one in robot.actuators
+    ]
+    return vsr.Scene(robot.rod, tendons, robot.loads)
+
+
+def chords(eq):
+    """Lengths and tensions of all chords, (tendons, spans)."""
+    X = np.linspace(0, 2 * straight_tendons.LENGTH, 2 * SEVERAL + 1)
+    nodes, forces, lengths = eq.nodes, np.asarray(eq.forces), np.zeros((6, 2 * SEVERAL))
+    tensions = np.zeros_like(lengths)
+    for i, sections in enumerate(straight_tendons.SECTIONS):
+        inside = X[: SEVERAL * sections + 1]
+        corners = np.asarray(eq.thread(i, inside))
+        lengths[i, : len(inside) - 1] = np.linalg.norm(np.diff(corners, axis=0), axis=1)
+        share = np.interp(0.5 * (X[1:] + X[:-1]), nodes.grid.X.T.ravel(), nodes.shares[i].T.ravel())
+        tensions[i] = -forces[i] * share
+    return lengths, tensions
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("friction", "motion"), [(0.2, "pull"), (0.2, "release"), (0.3, "pull")])
+def test_friction_in_holes_is_that_of_a_chain_of_pulleys(friction, motion):
+    places = jnp.linspace(0, 2 * straight_tendons.LENGTH, 2 * SEVERAL + 1)
+    eq = vsr.solve(
+        rubbing(friction, motion), PULLED.tensions, model=vsr.StrainDependent(40), throw=True
+    )
+    pulleys = straight_tendons.rods(SEVERAL, PULLED)._replace(
+        friction=friction if motion == "pull" else -friction
+    )
+    expected = rods_between_discs.solve(pulleys, axial=True)
+    length = 2 * straight_tendons.LENGTH
+    np.testing.assert_allclose(eq.position(places), expected, atol=3e-8 * length)
+    without = rods_between_discs.solve(pulleys._replace(friction=0.0), axial=True)
+    assert np.abs(expected - without).max() > 0.01 * length
+
+
+@pytest.mark.slow
+def test_chords_stick_and_slip_along_a_path_and_close_their_cycle():
+    """Against a chain of pulleys, chord by chord; then the energy of a closed cycle: the arm keeps
+    none, so that the chords do no work on it, and what the motors give is lost in the holes."""
+    shares = np.concatenate(
+        [np.linspace(0.2, 1, 17), np.linspace(1, 0.2, 17)[1:], np.linspace(0.2, 1, 17)[1:]]
+    )
+    path = shares[:, None] * np.array(PULLED.tensions)
+    eqs = vsr.follow(rubbing(0.2), path, model=vsr.StrainDependent(20))
+    assert np.all(eqs.status == vsr.Status.CONVERGED)
+    pulleys = straight_tendons.rods(SEVERAL, PULLED)._replace(friction=0.2)
+    found = []
+    for i, expected in enumerate(rods_between_discs.follow(pulleys, path)):
+        lengths, tensions = chords(jax.tree.map(lambda x, i=i: x[i], eqs))
+        np.testing.assert_allclose(tensions, expected.tension, atol=1e-5)
+        np.testing.assert_allclose(lengths, expected.length, atol=1e-7)
+        found.append((lengths, tensions))
+    cycle = found[16:]
+    work, given, lost = 0.0, 0.0, 0.0
+    for (before, pull), (after, more) in zip(cycle[:-1], cycle[1:], strict=True):
+        mean, change = 0.5 * (pull + more), after - before
+        work -= np.sum(mean * change)
+        given -= np.sum(mean[:, 0] * np.sum(change, axis=1))
+        beyond = np.cumsum(change[:, ::-1], axis=1)[:, ::-1]
+        lost -= np.sum((mean[:, :-1] - mean[:, 1:]) * beyond[:, 1:])
+    assert given > 1e-4
+    np.testing.assert_allclose(work, 0.0, atol=1e-2 * given)
+    np.testing.assert_allclose(given, lost, rtol=1e-2)
+
+
+@pytest.mark.slow
+def test_elastic_lengths_with_friction_in_holes_give_back_the_tensions():
+    """The stretch of each chord is that by its own tension."""
+    model, stiffness = vsr.StrainDependent(20), 5e3
+    eq = vsr.solve(rubbing(0.2), PULLED.tensions, model=model, throw=True)
+    _, tensions = chords(eq)
+    driven = rubbing(0.2, control="length", stiffness=stiffness)
+    rest = np.array([driven.rest_length(i) for i in range(6)])
+    per_chord = 2 * straight_tendons.LENGTH / (2 * SEVERAL)
+    mean = np.sum(tensions, axis=1) * per_chord / rest
+    changes = eq.lengths / (1 + mean / stiffness) - rest
+    found = vsr.solve(driven, changes, model=model, throw=True)
+    np.testing.assert_allclose(-found.forces, PULLED.tensions, atol=1e-6)
+
+
+def test_gradients_by_friction_and_discs():
+    """In both modes, of a number by the friction, a disc, the offset and a tension."""
+
+    def number(p):
+        discs = vsr.Discs(places=jnp.stack([p[1], 0.17 + 0 * p[1], 0.3 + 0 * p[1]]))
+        rod = vsr.Rod(LENGTH, vsr.Circular(RADIUS), MATERIAL, discs=discs)
+        paths = vsr.Parallel(p[2], 0.001), PATHS[1]
+        tendons = [vsr.Tendon(path, straight=True, friction=p[0]) for path in paths]
+        robot = vsr.Scene(rod, tendons, [vsr.Gravity()])
+        eq = vsr.solve(robot, jnp.stack([p[3], 1.0 + 0 * p[3]]), model=vsr.StrainDependent(6))
+        return eq.tip[:3, 3] @ jnp.array([1.0, -2.0, 3.0])
+
+    p, scale = jnp.array([0.2, 0.08, 0.007, 2.0]), jnp.array([1e-2, 1e-3, 1e-4, 1e-2])
+    solve, reverse = with_derivative(number), jax.jit(jax.grad(number))(p)
+    forward = solve(p)[1]
+    differences = central_differences(lambda unit: solve(p + scale * unit)[0], 4)
+    np.testing.assert_allclose(forward * scale, differences, rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-8)
+    assert np.all(np.abs(forward) > 1e-4)
