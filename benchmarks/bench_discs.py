@@ -24,8 +24,13 @@ from vsr_jax.studies.timing import Timed, machine, primitives, take_turns
 
 LENGTH, OFFSET, DISCS = 0.2, 0.008, 20
 MODEL = vsr.StrainDependent(DISCS)
-RANGES = {"tension": (0.0, 4.0), "length": (-2e-3, 1e-3)}
-"""Inputs [N] and [m]."""
+CONTROLS = "tension", "length"
+MOST_TENSION, MOST_BEND = 4.0, 1.0
+"""Of each tendon [N]; of each section, in any direction [rad], where lengths are driven."""
+CABLE = 5e3
+"""Axial stiffness of the cables [N], where lengths are driven."""
+ANGLES, SECTIONS = np.pi / 3 * np.arange(6), np.array([1, 2] * 3)
+"""Places of the holes around the wire, and the last section of each tendon."""
 SIDES = {"along the section": False, "between discs": True}
 WORKSPACE = 5000
 
@@ -35,19 +40,28 @@ def robot(straight: bool, control: Any) -> vsr.Scene:
     discs = vsr.Discs(DISCS, radius=1.1 * OFFSET, mass=2e-4)
     nitinol = vsr.Material(60e9, poisson=0.3, density=6450.0)
     wire = vsr.Rod(LENGTH, vsr.Circular(5e-4), nitinol, discs=discs)
-    angles = np.pi / 3 * np.arange(6)
-    holes = [vsr.Parallel(OFFSET * np.cos(a), OFFSET * np.sin(a)) for a in angles]
-    ends = [LENGTH / 2, None] * 3
+    stretch = {"stiffness": CABLE} if control == "length" else {}
     tendons = [
-        vsr.Tendon(hole, end=end, control=control, straight=straight)
-        for hole, end in zip(holes, ends, strict=True)
+        vsr.Tendon(
+            vsr.Parallel(OFFSET * np.cos(a), OFFSET * np.sin(a)),
+            end=None if sections == 2 else LENGTH / 2,
+            control=control,
+            straight=straight,
+            **stretch,
+        )
+        for a, sections in zip(ANGLES, SECTIONS, strict=True)
     ]
     return vsr.Scene(wire, tendons, [vsr.Gravity(), vsr.Payload(0.02)])
 
 
 def inputs(control: str, count: int) -> jax.Array:
-    """Random inputs in their range."""
-    return jnp.asarray(np.random.default_rng(0).uniform(*RANGES[control], (count, 6)))
+    """Random tensions, or the lengths by which sections bend as arcs in random directions."""
+    random = np.random.default_rng(0)
+    if control == "tension":
+        return jnp.asarray(random.uniform(0, MOST_TENSION, (count, 6)))
+    bends, around = random.uniform(0, (MOST_BEND, 2 * np.pi), (count, 2, 2)).T
+    pulls = OFFSET * bends[..., None] * np.cos(around[..., None] - ANGLES)
+    return jnp.asarray(-pulls[0] - np.where(SECTIONS == 2, pulls[1], 0.0))
 
 
 def calls(scene: vsr.Scene, control: str, batch: int) -> dict[str, tuple[Callable, tuple, int]]:
@@ -118,7 +132,7 @@ def main() -> None:
     )
     print("|---|---|---|---|---|---|---|---|")
     rows = []
-    for control in RANGES:
+    for control in CONTROLS:
         for row in measure(control, options.batch, options.rounds):
             rows.append(row)
             scale = options.batch if row["name"].startswith("batch") else 1e3

@@ -38,7 +38,8 @@ class Robot(NamedTuple):
     its tension; force at the tip in the world frame. The arm lies along x.
 
     `friction`: coefficient of the holes, positive for pull and negative for release; `before`:
-    tensions (tendons, pieces) that the chords had, if the arm follows a path."""
+    tensions (tendons, pieces) that the chords had, if the arm follows a path; `weight`: of each
+    disc in the world frame."""
 
     lengths: np.ndarray
     stiffness: np.ndarray
@@ -48,6 +49,7 @@ class Robot(NamedTuple):
     force: np.ndarray
     friction: float = 0.0
     before: np.ndarray | None = None
+    weight: np.ndarray = np.zeros(3)
 
     @property
     def units(self) -> np.ndarray:
@@ -78,9 +80,15 @@ def _balance(robot: Robot, axial: bool) -> np.ndarray:
     """The wrenches at the starts of all pieces, without units."""
     x = np.zeros(6 * len(robot.lengths))
     for share in SHARES:
-        part = robot._replace(tension=share * robot.tension, force=share * robot.force)
-        x = _newton(part, x, axial)
+        x = newton(scaled(robot, share), x, axial)
     return x
+
+
+def scaled(robot: Robot, share: float) -> Robot:
+    """The robot with a share of its tensions, weights and the force at its tip."""
+    return robot._replace(
+        tension=share * robot.tension, force=share * robot.force, weight=share * robot.weight
+    )
 
 
 class Sample(NamedTuple):
@@ -101,7 +109,7 @@ def follow(robot: Robot, path: np.ndarray) -> list[Sample]:
     x, before, found = np.zeros(6 * shape[1]), np.zeros(shape), []
     for tension in path:
         now = robot._replace(tension=tension, before=before)
-        x = _newton(now, x, True)
+        x = newton(now, x, True)
         at = discs(now, x)
         tension, length = np.zeros(shape), np.zeros(shape)
         for i in range(shape[0]):
@@ -113,7 +121,7 @@ def follow(robot: Robot, path: np.ndarray) -> list[Sample]:
     return found
 
 
-def _newton(robot: Robot, x: np.ndarray, axial: bool) -> np.ndarray:
+def newton(robot: Robot, x: np.ndarray, axial: bool) -> np.ndarray:
     """Root of the residual, from x; a step that does not lower it is halved."""
     moves = DIFFERENCE * np.eye(len(x))
     for _ in range(MOST_ITERATIONS):
@@ -178,6 +186,7 @@ def residual(robot: Robot, x: np.ndarray, axial: bool) -> np.ndarray:
     R = at.rotation
     tip = np.broadcast_to([0, 0, 0, *robot.force], at.start[..., :1, :].shape)
     missing = at.end - np.concatenate([at.start[..., 1:, :], tip], -2)
+    missing[..., 3:] -= robot.weight
     for i, (hole, last) in enumerate(zip(robot.holes, robot.last, strict=True)):
         arm = _apply(R, np.array([0.0, *hole]))
         on = -(pull := _chords(robot, i, at)[1])

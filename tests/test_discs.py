@@ -271,9 +271,10 @@ def test_gradients_in_both_modes_are_finite_differences():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("friction", [None, 0.2])
 @pytest.mark.parametrize("loads", [(), (vsr.Gravity(),)])
-def test_a_batch_is_its_arms(loads):
-    guided = scene(loads, discs=3)
+def test_a_batch_is_its_arms(loads, friction):
+    guided = scene(loads, discs=3, friction=friction)
 
     def tip(inputs):
         return vsr.solve(guided, inputs, model=STEPS).tip[:3, 3]

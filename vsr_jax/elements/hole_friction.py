@@ -113,7 +113,8 @@ class HoleFriction(ThreadRule):
 
     def _at_nodes(self, share: Array, grid: Grid) -> Array:
         """Values (spans,) at the nodes, zero beyond the last disc."""
-        return jnp.broadcast_to(jnp.sum(share[:, None] * self.inside, axis=0), grid.X.shape)
+        of_step = jnp.sum(share[:, None] * self.inside, axis=0)
+        return jnp.broadcast_to(of_step, (grid.X.shape[0], *of_step.shape))
 
     def _share(self, i: int, x: Array, tension: Array) -> tuple[Array, Array | None]:
         """Share of the tension at the start in each span, and 1 where the tendon slips, 0 where it
