@@ -167,6 +167,13 @@ def by_lengths(kind: Kind, draws: Draw, changes: jax.Array) -> tuple[jax.Array, 
     return jax.vmap(answer)(draws, changes)
 
 
+def lengths(draws: Draw, found: Answer) -> jax.Array:
+    """Changes of length of the cables in the shapes that were found; those without tension get
+    some slack."""
+    change = jnp.asarray(found.length / (1 + found.mean / CABLE) - found.rest)
+    return jnp.where(draws.tension > 0, change, change + 1e-2 * OFFSET)
+
+
 def confirmed(robot: independent.Robot, strain: np.ndarray) -> str:
     """Whether the forces of a shape balance at all discs."""
     wrench = (strain - np.array([0, 0, 0, 1, 0, 0])) * robot.stiffness
@@ -202,11 +209,8 @@ def search(kind: Kind, count: int, seed: int) -> dict[str, Any]:
         confirmed(rods(kind, draw), found.strain[i]) if solved[i] else sought(rods(kind, draw))
         for i, draw in enumerate(each)
     ]
-    # cables that are taut keep their lengths, the others get some slack
     tension = np.asarray(draws.tension)
-    change = found.length / (1 + found.mean / CABLE) - found.rest
-    change = np.where(tension > 0, change, change + 1e-2 * OFFSET)
-    status, tensions = map(np.asarray, by_lengths(kind, draws, jnp.asarray(change)))
+    status, tensions = map(np.asarray, by_lengths(kind, draws, lengths(draws, found)))
     unit = BENDING / (LENGTH * OFFSET)
     same = np.all(np.abs(tensions - tension) < SAME * unit, axis=1)
     driven = np.where(status != vsr.Status.CONVERGED, "refused", np.where(same, "same", "others"))

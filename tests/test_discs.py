@@ -1,5 +1,7 @@
 """Tendons that run straight from disc to disc."""
 
+from itertools import pairwise
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +11,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 import vsr_jax as vsr
-from benchmarks import rods_between_discs, straight_tendons
+from benchmarks import bench_discs, disc_search, rods_between_discs, straight_tendons
 from vsr_jax.files.scene_file import parse_scene, to_toml
 
 LENGTH, RADIUS, YOUNG = 0.3, 0.01, 1e6
@@ -445,7 +447,7 @@ def test_chords_stick_and_slip_along_a_path_and_close_their_cycle():
         found.append((lengths, tensions))
     cycle = found[16:]
     work, given, lost = 0.0, 0.0, 0.0
-    for (before, pull), (after, more) in zip(cycle[:-1], cycle[1:], strict=True):
+    for (before, pull), (after, more) in pairwise(cycle):
         mean, change = 0.5 * (pull + more), after - before
         work -= np.sum(mean * change)
         given -= np.sum(mean[:, 0] * np.sum(change, axis=1))
@@ -490,3 +492,37 @@ def test_gradients_by_friction_and_discs():
     np.testing.assert_allclose(forward * scale, differences, rtol=1e-5, atol=1e-9)
     np.testing.assert_allclose(forward, reverse, rtol=1e-8)
     assert np.all(np.abs(forward) > 1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "draw"), [(0, 10), (2, 3), (5, 3)])
+def test_lengths_of_a_shape_give_back_its_tensions(kind, draw):
+    """Draws of `disc_search` whose cables make each other slack in turn, without friction and with:
+    they are solved on the way with springs that harden."""
+    kind = disc_search.KINDS[kind]
+    drawn = disc_search.drawn(kind, np.random.default_rng((0, draw)))
+    draws = jax.tree.map(lambda x: jnp.asarray(x)[None], drawn)
+    found = disc_search.by_tensions(kind, draws)
+    status, tensions = disc_search.by_lengths(kind, draws, disc_search.lengths(draws, found))
+    assert status[0] == vsr.Status.CONVERGED
+    np.testing.assert_allclose(tensions[0], drawn.tension, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_lengths_that_rub_along_a_path():
+    """Six cables that bend an arm there and back, in 26 samples: 17 evaluations each."""
+    robot = bench_discs.robot(True, "length")
+    tendons = [
+        vsr.Tendon(
+            one.routing, end=one.end, control="length", stiffness=5e3, friction=0.1, straight=True
+        )
+        for one in robot.actuators
+    ]
+    path = np.interp(np.arange(27), [0, 13, 26], [0.0, 1.0, 0.0])[1:, None]
+    eqs = vsr.follow(
+        vsr.Scene(robot.rod, tendons, robot.loads),
+        path * bench_discs.inputs("length", 1),
+        model=vsr.StrainDependent(20),
+    )
+    assert np.all(eqs.status == vsr.Status.CONVERGED)
+    assert np.sum(eqs.steps) < 700

@@ -294,10 +294,11 @@ def _iteration(
         lambda x: jnp.broadcast_to(x, (*x.shape[: x.ndim - len(arms)], *arms)),
         (_point(origin if guess is None else guess, free), _point(origin, free)),
     )
-    sizes = _Sizes(whole, free, arms)
+    sizes, schedule = _Sizes(whole, free, arms), schedule_of(whole, guess)
 
     def evaluate(point: _Point, damping: Array, stage: Stage) -> Damped:
-        problem = whole.loosened(stage.loose).with_share(stage.share)
+        problem = whole.loosened(stage.loose)
+        problem = problem.with_share(stage.share, hardens=schedule.stages > 0)
         if whole.constrained and (guess is None or not whole.begins_soft):
             bent = stage.loose if whole.begins_soft else stage.restarted
             soft = jnp.clip(2.0 - stage.share, 0.0, 1.0)
@@ -329,18 +330,25 @@ def _iteration(
         Measures(sizes.work, sizes.turn, sizes.stirs(start), dot),
         start,
         floor,
-        schedule_of(whole, guess),
+        schedule,
         None if guess is None else origin,
     )
 
 
 def schedule_of(problem: ArmProblem, guess: ArmUnknown | None = None) -> Schedule:
-    """Load increments and stages of a problem that begins from a guess or from rest."""
+    """Load increments and stages of a problem that begins from a guess or from rest.
+
+    Cables of given length that rub have no energy, and springs in series with them lead from rest
+    only: where these begin from a guess, paths of six such cables take half as many evaluations
+    without (`test_lengths_that_rub_along_a_path` in tests/test_discs.py).
+    """
     loaded = problem.loads is not None and not problem.begins_soft
+    energy = problem.constrained or not problem.follows_rate
+    hardens = problem.hardens and (energy or guess is None)
     return Schedule(
         LOAD_INCREMENTS if loaded else 1,
-        HARDENING_STAGES if problem.hardens else 0,
+        HARDENING_STAGES if hardens else 0,
         SOFT_STAGES if problem.constrained else HARDENING_STAGES,
-        direct=guess is not None or loaded or (problem.hardens and not problem.begins_soft),
+        direct=guess is not None or loaded or (hardens and not problem.begins_soft),
         damping=0.0 if guess is not None or loaded else FIRST_DAMPING,
     )

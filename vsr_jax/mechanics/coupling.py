@@ -62,11 +62,12 @@ class ArmProblem(NamedTuple):
     loads: Loading | None
     couplings: tuple["Coupling", ...]
 
-    def with_share(self, share: Array) -> "ArmProblem":
-        """The problem with a fraction of its loads. What hardens is soft up to the fraction 1, with
-        all loads; above it, it hardens up to 2, where it is exact."""
+    def with_share(self, share: Array, *, hardens: bool) -> "ArmProblem":
+        """The problem with a fraction of its loads. What hardens, if that is a part of the way, is
+        soft up to the fraction 1, with all loads; above it, it hardens up to 2, where it is
+        exact."""
         problem = self
-        if self.hardens:
+        if hardens:
             hardness, share = jnp.maximum(share - 1.0, 0.0), jnp.minimum(share, 1.0)
             softer = tuple(one.softened(hardness) for one in self.couplings)
             problem = self._replace(couplings=softer)
@@ -147,11 +148,8 @@ class ArmProblem(NamedTuple):
 
     @property
     def hardens(self) -> bool:
-        """Whether couplings are softer on the way to a solution. Springs of threads alone are not
-        where these rub, since they only help where there is an energy: six rubbing cables of given
-        length that bend an arm there and back are then not solved at every sample."""
-        energy = self.constrained or not self.follows_rate
-        return energy and any(one.hardens for one in self.couplings)
+        """Whether couplings can be softer on the way to a solution."""
+        return any(one.hardens for one in self.couplings)
 
     @property
     def begins_soft(self) -> bool:

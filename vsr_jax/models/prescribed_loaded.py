@@ -273,10 +273,10 @@ def _solve(basis: NodalBasis, problem: ArmProblem) -> Root:
     K = _regular(_gathered(basis.matrix, strained, problem.grid), _idle(basis, problem))
     sizes = _sizes_of(basis, K, problem)
     size = K.shape[0]
-    elastic = c.single(lu.diagonal(K))
+    elastic, schedule = c.single(lu.diagonal(K)), schedule_of(problem)
 
     def evaluate(unknown: GalerkinUnknown, damping: Array, stage: Stage) -> Damped:
-        part = problem.with_share(stage.share)
+        part = problem.with_share(stage.share, hardens=schedule.stages > 0)
         at = state_of(unknown, basis, part)
         r = imbalance(unknown, at, basis, part)
         J = approximate_tangent(unknown, at, basis, part)
@@ -306,7 +306,7 @@ def _solve(basis: NodalBasis, problem: ArmProblem) -> Root:
     floor = jnp.broadcast_to(rounding_of(problem), arms)
     stirs = jax.tree.map(jnp.zeros_like, first)._replace(q=_stirs(K, arms))
     measures = Measures(work, turn, stirs, dot if problem.follows_rate else None)
-    return iterated(damped_newton(evaluate, measures, first, floor, schedule_of(problem)))
+    return iterated(damped_newton(evaluate, measures, first, floor, schedule))
 
 
 def _stirs(K: Array, arms: Shape) -> Array:

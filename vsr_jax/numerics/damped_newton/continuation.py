@@ -26,9 +26,11 @@ _SLOW_DAMPING, _HARDER = 100.0, 0.25
 _SETTLED = 0.3
 """Norm of an undamped step, or angle [rad] by which it turns the arm, below which the next stage
 begins."""
+_DIRECT = 30
+"""Bound on the evaluations of a direct attempt where there are stages."""
 _SLIDING, _CLOSE = 20, 1e-3
-"""Bound on the evaluations of a first attempt where something slides with friction, and norm of a
-step below which the attempt may take twice as many."""
+"""The same where something slides with friction, and norm of a step below which the attempt may
+take twice as many."""
 _JUMPING, _BACK = 40, 2
 """Number of evaluations without an energy after which the problem is loosened, and by how many
 stages it goes back then."""
@@ -149,15 +151,19 @@ def fails(
     (`test_an_arm_that_would_snap_aside_is_found_aside` in tests/test_contact_tube.py).
     """
     if setting.schedule.direct:
-        return _direct_fails(state, trial, verdict)
+        return _direct_fails(state, trial, verdict, setting.schedule)
     assert busy is not None
     unsolved = ~busy & ~(probe.stable(state) & termination.converged(state, setting))
     return unsolved | (state.evaluations >= _FIRST_STAGES)
 
 
-def _direct_fails(state: State, trial: Trial, verdict: Verdict) -> Array:
+def _direct_fails(state: State, trial: Trial, verdict: Verdict, schedule: Schedule) -> Array:
     """Which direct attempts fail: at the first step that is not accepted, at the first tangent that
-    is not positive definite, or as unstable; where something slides, after some evaluations.
+    is not positive definite, or as unstable; where something slides or there are stages, after some
+    evaluations.
+
+    Without the bound where there are stages, three cables that make each other slack in turn do so
+    without end (`test_lengths_of_a_shape_give_back_its_tensions` in tests/test_discs.py).
 
     Where an indefinite tangent is damped instead, the hard arms of `TABLE` in
     tests/test_hard_loads.py take 10 % more evaluations. Without the bound for what slides, one of
@@ -169,7 +175,8 @@ def _direct_fails(state: State, trial: Trial, verdict: Verdict) -> Array:
         stopped = stopped | trial.new.out
     failed = jnp.where(trial.solving, stopped, probe.unstable(state.probe))
     if verdict.sliding is None:
-        return failed
+        late = trial.solving & (state.evaluations > _DIRECT)
+        return failed | late if schedule.stages else failed
     most = jnp.where(state.local.step_norm < _CLOSE, 2 * _SLIDING, _SLIDING)
     late = trial.solving & (state.evaluations > most)
     return (failed & ~(trial.solving & verdict.sliding)) | late
