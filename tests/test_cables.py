@@ -332,3 +332,27 @@ def test_a_scene_names_its_effects():
     )
     assert scene().effects == ("tendons",)
     assert eqx.tree_equal(vsr.Scene(ARM, []).effects, ())
+
+
+def test_motors_wind_cables_on_spools():
+    """By angle in place of length, from a slack of 1 mm; and the derivative by the radius."""
+    rod = vsr.Rod(0.2, vsr.Circular(0.005), vsr.Material(1e6, poisson=0.45))
+    path = vsr.Parallel(0.004, 0.0)
+
+    def tip(spool, angle):
+        tendon = vsr.Tendon(path, control="length", spool=spool, offset=1e-3)
+        return vsr.solve(vsr.Scene(rod, [tendon]), jnp.stack([angle])).tip[:3, 3]
+
+    by_length = vsr.Scene(rod, [vsr.Tendon(path, control="length")])
+    expected = vsr.solve(by_length, [1e-3 - 0.008 * 0.5], throw=True).tip[:3, 3]
+    np.testing.assert_allclose(tip(jnp.array(0.008), jnp.array(0.5)), expected, atol=1e-12)
+    slopes = jax.jacfwd(tip, (0, 1))(jnp.array(0.008), jnp.array(0.5))
+    np.testing.assert_allclose(slopes[0] / 0.5, slopes[1] / 0.008, atol=1e-9)
+    assert vsr.Tendon(path, control="length", spool=0.008).unit == "rad"
+    wound = vsr.Scene(rod, [vsr.Tendon(path, control="length", spool=0.008)])
+    with pytest.raises(
+        ValueError, match=r"inputs\[0\]: got 30 rad, need a change of length > -0.2"
+    ):
+        vsr.solve(wound, [30.0])
+    with pytest.raises(ValueError, match=r"Tendon.spool: got 0.01 with control='tension'"):
+        vsr.Tendon(path, spool=0.01)

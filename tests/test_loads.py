@@ -244,7 +244,7 @@ def test_a_turned_base_turns_dead_loads_the_other_way():
             lambda: vsr.solve(
                 vsr.Scene(ARM, [vsr.Tendon(vsr.Parallel(0.0, 0.0), control="length")]), [-0.6]
             ),
-            r"inputs\[0\]: got -0\.6, need a change of length > -0\.5 m",
+            r"inputs\[0\]: got -0\.6 m, need a change of length > -0\.5 m",
         ),
         (
             lambda: vsr.solve(

@@ -171,7 +171,8 @@ class Tendon(Actuator):
     $$T \ge 0, \quad (l^* + \delta)(1 + T / k) - l \ge 0, \quad \text{one of the two is zero},$$
 
     with $l^*$ the length of the path at rest, $l$ that of the deformed arm and $k$ the cable's
-    axial stiffness $EA$ (infinite by default).
+    axial stiffness $EA$ (infinite by default). A motor winds the cable on a spool of radius r: then
+    the input is the angle $\alpha$ [rad] of the motor, $\delta = \delta_0 - r \alpha$.
 
     With friction the tension decays with the turning angle $\varphi$ of the cable from its start,
     $T(X) = T e^{\mp \mu \varphi(X)}$ (the capstan equation): minus while the motor pulls, plus
@@ -192,7 +193,8 @@ class Tendon(Actuator):
     - `routing`, `start`, `end`: as for every actuator; a straight one starts and ends in discs, by
       default at the base and in the last disc.
     - `control`: `"tension"` or `"length"`.
-    - `stiffness`: $k$ [N], for `control="length"` only.
+    - `stiffness`: $k$ [N], `spool`: r [m], `offset`: $\delta_0$ [m], by default zero; for
+      `control="length"` only. A negative radius winds the other way.
     - `friction`: coefficient $\mu$ [-], none by default.
     - `motion`: `"pull"` or `"release"`, the direction in which friction acts.
     - `straight`: whether it runs straight between the discs of the rod, not along its path.
@@ -202,6 +204,8 @@ class Tendon(Actuator):
     start: Scalar | None = eqx.field(metadata={"unit": "m"})
     end: Scalar | None = eqx.field(metadata={"unit": "m"})
     stiffness: Scalar | None = eqx.field(metadata={"unit": "N"})
+    spool: Scalar | None = eqx.field(metadata={"unit": "m"})
+    offset: Scalar | None = eqx.field(metadata={"unit": "m"})
     friction: Scalar | None = eqx.field(metadata={"unit": "-"})
     straight: bool = eqx.field(static=True)
     control: Literal["tension", "length"] = eqx.field(static=True)
@@ -216,20 +220,26 @@ class Tendon(Actuator):
         end: ScalarLike | None = None,
         control: Literal["tension", "length"] = "tension",
         stiffness: ScalarLike | None = None,
+        spool: ScalarLike | None = None,
+        offset: ScalarLike | None = None,
         friction: ScalarLike | None = None,
         motion: Literal["pull", "release"] = "pull",
         straight: bool = False,
     ):
         self.routing, self.start, self.end = _checked("Tendon", routing, start, end)
         self.control = choice("Tendon.control", control, ("tension", "length"))
-        if stiffness is not None and control == "tension":
-            raise ValueError(
-                "Tendon.stiffness: got a stiffness with control='tension', need control='length' "
-                "(a given tension does not use it)"
-            )
+        of_lengths = {"stiffness": stiffness, "spool": spool, "offset": offset}
+        for name, value in of_lengths.items():
+            if value is not None and control == "tension":
+                raise ValueError(
+                    f"Tendon.{name}: got {value!r} with control='tension', need control='length' "
+                    f"(a given tension does not use it)"
+                )
         self.stiffness = (
             None if stiffness is None else numbers("Tendon.stiffness", stiffness, positive=True)
         )
+        self.spool = None if spool is None else numbers("Tendon.spool", spool)
+        self.offset = None if offset is None else numbers("Tendon.offset", offset)
         self.friction = (
             None if friction is None else numbers("Tendon.friction", friction, least=0.0)
         )
@@ -238,7 +248,9 @@ class Tendon(Actuator):
 
     @property
     def unit(self) -> str:
-        return "N" if self.control == "tension" else "m"
+        if self.control == "tension":
+            return "N"
+        return "m" if self.spool is None else "rad"
 
     @property
     def lowest(self) -> float:
@@ -282,7 +294,10 @@ class Tendon(Actuator):
         return -value if self.control == "tension" else jnp.zeros_like(value)
 
     def free_length(self, rest: ScalarLike, value: ScalarLike) -> Scalar:
-        return real(rest) + real(value) if self.length_driven else real(rest)
+        if not self.length_driven:
+            return real(rest)
+        change = real(value) if self.spool is None else -self.spool * real(value)
+        return real(rest) + (change if self.offset is None else change + self.offset)
 
     def law(self, thread: ThreadState, value: ScalarLike) -> Scalar:
         """The smaller of tension and slack, as a force."""

@@ -342,10 +342,11 @@ class Scene(Part):
                 )
         for i in self.length_driven:
             length = concrete(self.rest_length(i))
-            if length is not None and not known[i] > -length:
+            change = concrete(self.actuators[i].free_length(0.0, known[i]))
+            if length is not None and change is not None and not change > -length:
                 raise ValueError(
-                    f"inputs[{i}]: got {known[i]:g}, need a change of length > {-length:g} m, the "
-                    f"negative of the tendon's length at rest"
+                    f"inputs[{i}]: got {known[i]:g} {self.actuators[i].unit}, need a change of "
+                    f"length > {-length:g} m, the negative of the tendon's length at rest"
                 )
         return array
 

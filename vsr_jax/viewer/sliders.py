@@ -194,7 +194,9 @@ def _visible_input(scene: Scene, actuator: Actuator) -> float:
         force = min(_BEND * bending / (length * lever), force)
     if actuator.length_driven:  # by bending and by stretching
         bent = force * length * lever / bending
-        return float(f"{bent * lever + force * length / stretching:.2g}")
+        change = bent * lever + force * length / stretching
+        spool = getattr(actuator, "spool", None)
+        return float(f"{change if spool is None else change / abs(float(spool)):.2g}")
     area = actuator.pressure_area
     return float(f"{force if area is None else force / float(area):.2g}")
 
