@@ -40,7 +40,7 @@ def robot(straight: bool, control: Any) -> vsr.Scene:
     discs = vsr.Discs(DISCS, radius=1.1 * OFFSET, mass=2e-4)
     nitinol = vsr.Material(60e9, poisson=0.3, density=6450.0)
     wire = vsr.Rod(LENGTH, vsr.Circular(5e-4), nitinol, discs=discs)
-    stretch = {"stiffness": CABLE} if control == "length" else {}
+    stretch: dict[str, Any] = {"stiffness": CABLE} if control == "length" else {}
     tendons = [
         vsr.Tendon(
             vsr.Parallel(OFFSET * np.cos(a), OFFSET * np.sin(a)),

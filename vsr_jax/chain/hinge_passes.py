@@ -7,9 +7,9 @@ gives the motions.
 
 One arm would wait for many small operations in that, and stiffness across spans of steps (`spans`)
 needs both ends of each. There the hinges are put together step by step, all steps at once: by the
-same pass over the hinges of a step, with the wrench beyond its end, $W_1$, as further unknowns. With
-the motions $z_0, z_1$ at both ends of a step, which are before its first hinge and that of the next
-step here,
+same pass over the hinges of a step, with the wrench beyond its end, $W_1$, as further unknowns.
+With the motions $z_0, z_1$ at both ends of a step, which are before its first hinge and that of the
+next step here,
 
 $$z_1 = T z_0 + F W_1 + f, \quad W_0 = S z_0 + G W_1 + s.$$
 

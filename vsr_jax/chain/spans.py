@@ -9,9 +9,10 @@ so that the wrench beyond its end changes by $-S_{11} z_1 - S_{10} z_0$ and that
 $-S_{01} z_1 - S_{00} z_0$, where $S_{10} = \sum_j b_j a_j^T$ and so on.
 
 A pass from the tip knows the wrench beyond the end of a span by the motion there. It adds $-S_{11}$
-to that, and takes the force $\phi = -S_{10} z_0$ as an unknown of the steps of the span, with columns
-of its own in all that it keeps, and with the motion of the end of the span beside the wrench. At the
-start of the span $\phi$ is known by the motion there, and $-S_{01} z_1 - S_{00} z_0$ is added.
+to that, and takes the force $\phi = -S_{10} z_0$ as an unknown of the steps of the span, with
+columns of its own in all that it keeps, and with the motion of the end of the span beside the
+wrench. At the start of the span $\phi$ is known by the motion there, and $-S_{01} z_1 - S_{00} z_0$
+is added.
 """
 
 from typing import NamedTuple

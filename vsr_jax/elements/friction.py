@@ -124,20 +124,11 @@ class Friction(ThreadRule):
     def _share(
         self, i: int, decay: Array, tension: Array, at: tuple[Array, Array] | None
     ) -> tuple[Array, Array | None]:
-        """Share of the tension at the start, from the exponent of its decay, and 1 where the cable
-        slips, 0 where it sticks (None without memory); `at`: nodes and abscissas, if these are
-        not the nodes."""
-        least = jnp.exp(-decay)
-        if self.memory is None:
-            return least, None
-        before = self.memory[i].tension
-        if at is not None:
+        """`share_of` a tension; `at`: nodes and abscissas, if these are not the nodes."""
+        before = None if self.memory is None else self.memory[i].tension
+        if before is not None and at is not None:
             before = jnp.interp(at[1], *(value.T.reshape(-1) for value in (at[0], before)))
-        most = jnp.exp(decay)
-        sticks = (before > tension * least) & (before < tension * most)
-        kept = before / jnp.where(sticks, tension, 1.0)
-        slipping = jnp.where(before >= tension * most, most, least)
-        return jnp.where(sticks, kept, slipping), jnp.where(sticks, 0.0, 1.0)
+        return share_of(tension, decay, before)
 
     def _slopes(self, x: Vector, at: ArmState) -> Vector:
         r"""Derivatives $\tau'$ along the arm of the forces of all threads."""
@@ -235,6 +226,20 @@ def _rows(
         at.xi, at.tau, slopes, change, sections, friction.sections_rate, free
     )
     return c.subtract(x, friction._rates(at.xi, xi_rate, sections))
+
+
+def share_of(tension: Array, decay: Array, before: Array | None) -> tuple[Array, Array | None]:
+    """Share of the tension at the start that is left after a `decay`, the exponent of it, where the
+    tension was `before`; and 1 where the cable slips, 0 where it sticks. Without a memory, None,
+    it slips everywhere."""
+    least = jnp.exp(-decay)
+    if before is None:
+        return least, None
+    most = jnp.exp(decay)
+    sticks = (before > tension * least) & (before < tension * most)
+    kept = before / jnp.where(sticks, tension, 1.0)
+    slipping = jnp.where(before >= tension * most, most, least)
+    return jnp.where(sticks, kept, slipping), jnp.where(sticks, 0.0, 1.0)
 
 
 def friction_of(scene: Scene, grid: Grid) -> Friction | None:

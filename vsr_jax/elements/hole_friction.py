@@ -32,7 +32,7 @@ from ..numerics.component import Forces, Vector
 from ..numerics.quadrature import Grid, locate
 from ..numerics.stacked import cross, dot
 from .chords import pull_on, spans_of
-from .friction import coefficient_of
+from .friction import coefficient_of, share_of
 
 
 class HoleFriction(ThreadRule):
@@ -117,17 +117,9 @@ class HoleFriction(ThreadRule):
         return jnp.broadcast_to(of_step, (grid.X.shape[0], *of_step.shape))
 
     def _share(self, i: int, x: Array, tension: Array) -> tuple[Array, Array | None]:
-        """Share of the tension at the start in each span, and 1 where the tendon slips, 0 where it
-        sticks (None without memory)."""
+        """`share_of` the tension at the start in each span."""
         decay = self.coefficients[i] * jnp.cumsum(x, axis=0)
-        least = jnp.exp(-decay)
-        if self.memory is None:
-            return least, None
-        before, most = self.memory[i], jnp.exp(decay)
-        sticks = (before > tension * least) & (before < tension * most)
-        kept = before / jnp.where(sticks, tension, 1.0)
-        slipping = jnp.where(before >= tension * most, most, least)
-        return jnp.where(sticks, kept, slipping), jnp.where(sticks, 0.0, 1.0)
+        return share_of(tension, decay, None if self.memory is None else self.memory[i])
 
     def after(self, x: Vector, at: ArmState, problem: ArmProblem) -> "HoleFriction":
         assert at.along is not None  # such tendons are loads
