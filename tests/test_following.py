@@ -300,3 +300,42 @@ def test_gradients_by_a_path_of_scenes():
     difference = (alone(1 + step) - alone(1 - step)) / (2 * step)
     np.testing.assert_allclose(jax.grad(followed)(1.0), difference, rtol=1e-7)
     np.testing.assert_allclose(jax.jvp(followed, (1.0,), (1.0,))[1], difference, rtol=1e-7)
+
+
+@pytest.mark.slow
+def test_samples_that_are_not_solved_are_approached_in_smaller_steps():
+    """Six elastic cables that rub bend an arm there and back: one sample is not solved at once. The
+    path with that step in two is the same."""
+    rod = vsr.Rod(
+        0.2,
+        vsr.Circular(5e-4),
+        vsr.Material(60e9, poisson=0.3, density=6450.0),
+        discs=vsr.Discs(20, radius=0.0088, mass=2e-4),
+    )
+    angles, whole = np.pi / 3 * np.arange(6), np.array([False, True] * 3)
+    tendons = [
+        vsr.Tendon(
+            vsr.Parallel(0.008 * np.cos(a), 0.008 * np.sin(a)),
+            end=None if to_tip else 0.1,
+            control="length",
+            stiffness=5e3,
+            friction=0.1,
+        )
+        for a, to_tip in zip(angles, whole, strict=True)
+    ]
+    robot = vsr.Scene(rod, tendons, [vsr.Gravity(), vsr.Payload(0.02)])
+    random = np.random.default_rng(0)
+    bends, towards = random.uniform(0.3, 1.2, 2), random.uniform(0, 2 * np.pi, 2)
+    pulls = 0.008 * bends[:, None] * np.cos(towards[:, None] - angles)
+    pull = pulls[0] + np.where(whole, pulls[1], 0.0)
+    path = -np.interp(np.arange(26), [0, 13, 25], [0.0, 1.0, 0.0])[:, None] * pull
+    model = vsr.StrainDependent(20)
+    with pytest.warns(UserWarning, match=r"follow: samples were approached .*: 3 in 2"):
+        found = vsr.follow(robot, path, model=model)
+    assert np.all(found.status == vsr.Status.CONVERGED)
+    under_jit = jax.jit(lambda u: vsr.follow(robot, u, model=model).status)(path)
+    assert np.flatnonzero(under_jit).tolist() == [3]
+    more = np.insert(path, 3, 0.5 * (path[2] + path[3]), axis=0)
+    expected = vsr.follow(robot, more, model=model)
+    forces, others = (jax.vmap(lambda eq: eq.forces)(eqs) for eqs in (found, expected))
+    np.testing.assert_allclose(forces[3:], others[4:], atol=1e-6)

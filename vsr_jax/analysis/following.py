@@ -17,8 +17,12 @@ force of at most $\mu \lambda$, or it slips, and $\mu \lambda$ opposes its motio
 considerations on transmission characteristics for tendon drive robots, ICAR 1991.
 """
 
+import warnings
+from functools import partial
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from ..arm.scene import Scene
@@ -29,7 +33,10 @@ from ..numerics.loops import scan
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import checked_outcome, near_of
 from ..typing import ArrayLike, cast
-from ..validation import instance, numbers
+from ..validation import instance, is_traced, numbers
+
+_SMALLER = 2, 4, 8
+"""Numbers of smaller steps in which a sample is approached that is not solved in one."""
 
 
 def follow(
@@ -72,6 +79,8 @@ def follow(
 
     **Returns:** an `Equilibrium` with a batch axis of that size, for use with `jax.vmap`, as in
     `jax.vmap(lambda eq: eq.tip)(path)`; `jax.tree.map(lambda x: x[-1], path)` is the last one. A
+    sample that is not solved from the one before is approached in 2, 4 or 8 smaller steps of the
+    inputs, with a warning, where all numbers are known and the scene is one for the whole path. A
     sample without an equilibrium has a status as of `solve`; the next one continues from the last
     that has one. Differentiable with respect to the inputs, the scene and `start`.
 
@@ -88,10 +97,64 @@ def follow(
     scene = cast(scene, values.dtype)
     first = jax.tree.map(lambda x: x[0], scene) if _several(scene) else scene
     before = model.at_rest(first, values.dtype) if start is None else _start(start, scene, model)
-    outcomes = _follow(scene, cast(before, values.dtype), values)
+    before = cast(before, values.dtype)
+    outcomes = _follow(scene, before, values)
+    known = not any(map(is_traced, jax.tree.leaves((scene, before, outcomes.status))))
+    if known and not _several(scene):
+        outcomes = _completed(scene, before, values, outcomes)
     each = (0 if _several(scene) else None, 0, 0)
     made = jax.vmap(lambda scene, u, outcome: Equilibrium(scene, u, model, outcome), each)
     return made(scene, values, outcomes)
+
+
+def _completed(scene: Scene, before: Near, inputs: Array, found: Outcome) -> Outcome:
+    """The outcomes of a path, with those samples approached in smaller steps that were not solved;
+    all by the same program, on a path of the same length."""
+    number, steps = len(inputs), {}
+    for i in range(number):
+        solved = np.asarray(found.status) == Status.CONVERGED
+        if solved[i]:
+            continue
+        last = np.flatnonzero(solved[:i])
+        near, first = before, jnp.zeros_like(inputs[0])
+        if last.size:
+            near, first = _at(before, found, int(last[-1])), inputs[last[-1]]
+        for parts in (parts for parts in _SMALLER if parts <= number):
+            share = jnp.arange(1, parts + 1, dtype=inputs.dtype)[:, None] / parts
+            way = _follow(scene, near, _padded(first + share * (inputs[i] - first), number))
+            if way.status[parts - 1] != Status.CONVERGED:
+                continue
+            there = [found, way]
+            if i + 1 < number:
+                after = _at(before, way, parts - 1)
+                there.append(_follow(scene, after, _padded(inputs[i + 1 :], number)))
+            found = jax.tree.map(partial(_joined, i, parts), *there)
+            steps[i] = parts
+            break
+    if steps:
+        named = ", ".join(f"{i} in {parts}" for i, parts in steps.items())
+        warnings.warn(
+            f"follow: samples were approached in smaller steps of the inputs: {named}",
+            stacklevel=3,
+        )
+    return found
+
+
+def _at(before: Near, found: Outcome, i: int) -> Near:
+    """Where a path goes on from a sample."""
+    forces, state = jax.tree.map(lambda x: x[i], (found.forces, found.state))
+    return before._replace(forces=forces, state=state)
+
+
+def _padded(inputs: Array, number: int) -> Array:
+    """Inputs, the last ones again up to a number of samples."""
+    return jnp.concatenate([inputs, jnp.repeat(inputs[-1:], number - len(inputs), axis=0)])
+
+
+def _joined(i: int, parts: int, found: Array, way: Array, *later: Array) -> Array:
+    """The samples before i, the end of the way to it, and those after it."""
+    rest = [x[: len(found) - i - 1] for x in later]
+    return jnp.concatenate([found[:i], way[parts - 1 : parts], *rest])
 
 
 def _several(scene: Scene) -> bool:
