@@ -34,7 +34,7 @@ def arm(*heights: float) -> vsr.Scene:
         LENGTH,
         vsr.Circular(0.0007),
         vsr.Material(54e9, poisson=0.3),
-        discs=vsr.Discs(10, radius=0.0101),
+        discs=vsr.Discs(20, radius=0.0101),
     )
     X = np.linspace(0, LENGTH, KNOTS)
     return vsr.Scene(
