@@ -234,7 +234,7 @@ def test_a_turned_base_turns_dead_loads_the_other_way():
         ),
         (
             lambda: vsr.Tendon(vsr.Parallel(0.0, 0.0), stiffness=1e4),
-            r"Tendon\.stiffness: got a stiffness with control='tension'",
+            r"Tendon\.stiffness: got 10000.0 with control='tension'",
         ),
         (
             lambda: vsr.Tendon(vsr.Parallel(0.0, 0.0), control="speed"),
