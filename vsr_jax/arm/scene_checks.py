@@ -20,6 +20,7 @@ from .obstacles import Obstacle
 from .profile import Limits
 from .rigid_piece import check_pieces
 from .rod import Rod
+from .thread_lines import hole_places
 
 _PROBES = 65
 """Evenly spaced abscissas at which limits are checked, besides the breakpoints and the middles
@@ -100,7 +101,7 @@ def _check_straight(name: str, actuator: Actuator, rod: Rod) -> None:
     if rod.discs is None:
         raise ValueError(f"{name}.straight: got True on a rod without discs, need Rod(discs=...)")
     length = float(rod.length)
-    places = np.concatenate([[0.0], np.asarray(rod.discs.along(length))])
+    places = np.asarray(hole_places(rod))
     for end, X in (("start", actuator.start), ("end", actuator.end)):
         if X is not None and np.min(np.abs(places - float(X))) > SAME * length:
             near = places[np.argmin(np.abs(places - float(X)))]

@@ -17,7 +17,7 @@ from .routing import thread_tangent
 
 def hole_places(rod: Rod) -> Float[Array, " places"]:
     """Abscissas [m] of the holes of an arm with discs: at its base and in the discs."""
-    assert rod.discs is not None  # see `check_straight`
+    assert rod.discs is not None  # see `check_numbers`
     return jnp.concatenate([jnp.zeros_like(rod.length)[None], rod.discs.along(rod.length)])
 
 

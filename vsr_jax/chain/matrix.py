@@ -70,14 +70,13 @@ class Chain(NamedTuple):
         # by steps, single precision loses signs of pivots of a limp arm under tension, for which a
         # step without what lies beyond it is indefinite
         limp = push is not None and b.dtype == jnp.float32
-        by_nodes = apart or b.ndim > 4 or limp
-        by_nodes = by_nodes and coupled.spans is None
-        hinges = self._hinges(coupled, b, push, 0 if by_nodes else 6)
-        if by_nodes:
-            found = solved_by_hinges(hinges, self.grid, self.free)
+        if coupled.spans is None and (apart or b.ndim > 4 or limp):
+            hinges = self._hinges(coupled, b, push, 0)
+            passed = solved_by_hinges(hinges, self.grid, self.free)
         else:
-            found = solved_by_joints(hinges, self.grid, self.free, self._spans(coupled, b))
-        strain, negative, asymmetry = found
+            hinges, spans = self._hinges(coupled, b, push, 6), self._spans(coupled, b)
+            passed = solved_by_joints(hinges, self.grid, self.free, spans)
+        strain, negative, asymmetry = passed
         found = self._free_part(self._turned(transpose(coupled.rotation), strain))
         return found, definiteness(negative, asymmetry, self.grid)
 

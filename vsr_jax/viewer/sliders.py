@@ -195,8 +195,8 @@ def _visible_input(scene: Scene, actuator: Actuator) -> float:
     if actuator.length_driven:  # by bending and by stretching
         bent = force * length * lever / bending
         change = bent * lever + force * length / stretching
-        spool = getattr(actuator, "spool", None)
-        return float(f"{change if spool is None else change / abs(float(spool)):.2g}")
+        per_input = actuator.free_length(0.0, 1.0) - actuator.free_length(0.0, 0.0)
+        return float(f"{change / abs(float(per_input)):.2g}")
     area = actuator.pressure_area
     return float(f"{force if area is None else force / float(area):.2g}")
 
