@@ -26,7 +26,7 @@ def arm(discs=None):
     """A rod with discs."""
     if isinstance(discs, int):
         discs = vsr.Discs(discs)
-    elif discs is not None:
+    elif discs is not None and not isinstance(discs, vsr.Discs):
         discs = vsr.Discs(places=discs)
     return vsr.Rod(LENGTH, vsr.Circular(RADIUS), MATERIAL, discs=discs)
 
@@ -311,15 +311,19 @@ def test_a_slack_tendon_with_discs_does_nothing():
 
 
 def test_scene_files_keep_discs():
-    for discs in (vsr.Discs(4, radius=0.02), vsr.Discs(places=PLACED, mass=[1e-3, 2e-3])):
+    for discs in (
+        vsr.Discs(4, radius=0.02, thickness=0.005),
+        vsr.Discs(places=PLACED, mass=[1e-3, 2e-3]),
+    ):
         rod = vsr.Rod(LENGTH, vsr.Circular(RADIUS), MATERIAL, discs=discs)
         robot = vsr.Scene(rod, [vsr.Tendon(PATHS[0], straight=True, end=discs.along(LENGTH)[0])])
         text = to_toml(robot)
         assert "straight = true" in text
         read = parse_scene(text).scene
         assert repr(read) == repr(robot)
-        assert read.effects == ("tendons", "sections", "straight tendons")
-        for name in ("places", "radius", "mass", "number"):
+        thick = () if discs.thickness is None else ("rigid pieces",)
+        assert read.effects == ("tendons", "sections", *thick, "straight tendons")
+        for name in ("places", "radius", "mass", "number", "thickness"):
             np.testing.assert_array_equal(getattr(read.rod.discs, name), getattr(discs, name))
 
 
@@ -334,6 +338,7 @@ def test_scene_files_keep_discs():
         ((), {"places": [-0.1]}, "Discs.places: got .*, need finite numbers > 0"),
         ((3,), {"radius": 0.0}, "Discs.radius: got 0.0, need"),
         ((3,), {"mass": -1.0}, "Discs.mass: got -1.0, need"),
+        ((3,), {"thickness": 0.0}, "Discs.thickness: got 0.0, need"),
         ((3,), {"mass": [1.0, 2.0]}, r"Discs.mass: got shape \(2,\), need one mass or 3"),
     ],
 )
@@ -346,6 +351,11 @@ def test_wrong_discs_are_refused(arguments, options, message):
     ("discs", "options", "message"),
     [
         ([0.1, 0.4], {}, r"Scene.rod.discs: got a disc at 0.4 m, need places on the arm of 0.3 m"),
+        (
+            vsr.Discs(places=[0.1, 0.12], thickness=0.02),
+            {},
+            r"Scene.rod.discs.thickness: got 0.02 m, need less than the 0.02 m from disc to disc",
+        ),
         (None, {}, r"actuators\[0\].straight: got True on a rod without discs, need Rod\(discs"),
         (3, {"end": 0.15}, r"actuators\[0\].end: got 0.15 m, need the place of a disc, such as"),
         (3, {"start": 0.05}, r"actuators\[0\].start: got 0.05 m, need the place of a disc"),
@@ -371,6 +381,27 @@ def test_the_weight_of_discs_is_that_of_payloads():
         expected = vsr.solve(vsr.Scene(arm(), [], loads), [], model=STEPS, throw=True)
         np.testing.assert_allclose(found.tip, expected.tip, atol=1e-9)
         np.testing.assert_allclose(found.energy.total, expected.energy.total, rtol=1e-9)
+
+
+def test_thick_discs_are_rigid_pieces_with_holes_at_both_faces():
+    """Weighed in their middles by `Payload`."""
+    places, half = np.array([0.1, 0.2, 0.3]), 0.004
+    faces = np.stack([places - 2 * half, places], axis=1)
+    thick = vsr.Discs(3, mass=0.02, thickness=2 * half)
+    thin, pieces = vsr.Discs(places=faces.ravel()), [vsr.RigidPiece(*x) for x in faces]
+    weights = [vsr.Payload(0.02, X) for X in places - half]
+
+    def solved(loads, discs, rigid=()):
+        rod = vsr.Rod(LENGTH, vsr.Circular(RADIUS), MATERIAL, discs=discs, rigid=rigid)
+        tendons = [vsr.Tendon(path, straight=True) for path in PATHS]
+        robot = vsr.Scene(rod, tendons, [vsr.Gravity(), *loads])
+        return vsr.solve(robot, TENSIONS, model=vsr.StrainDependent(48), throw=True)
+
+    found, expected = solved([], thick), solved(weights, thin, pieces)
+    np.testing.assert_allclose(found.tip, expected.tip, atol=5e-9)
+    np.testing.assert_allclose(found.lengths, expected.lengths, atol=5e-9)
+    assert "rigid pieces" in found.scene.effects
+    np.testing.assert_allclose(found.strain(places - half), np.tile([0, 0, 0, 1, 0, 0], (3, 1)))
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..typing import Scalar, ScalarLike, VectorLike, real
+from ..typing import ArrayLike, Scalar, ScalarLike, VectorLike, real
 from ..validation import concrete, count, numbers
 from .description import Part
 
@@ -24,12 +24,15 @@ class Discs(Part):
     - `radius`: of their rims [m], by default not known. It is part of the outline of the arm:
       threads must be inside, and obstacles are touched there.
     - `mass`: of each disc [kg], one number or one for each; `Gravity` acts on it.
+    - `thickness`: [m], of discs that hold the arm between their faces as a `RigidPiece` does; by
+      default they do not stiffen it. The abscissa of a disc is that of its face towards the tip.
     """
 
     number: int | None = eqx.field(static=True)
     places: Float[Array, " discs"] | None = eqx.field(metadata={"unit": "m"})
     radius: Scalar | None = eqx.field(metadata={"unit": "m"})
     mass: Scalar | Float[Array, " discs"] | None = eqx.field(metadata={"unit": "kg"})
+    thickness: Scalar | None = eqx.field(metadata={"unit": "m"})
 
     def __init__(
         self,
@@ -38,6 +41,7 @@ class Discs(Part):
         places: VectorLike | None = None,
         radius: ScalarLike | None = None,
         mass: VectorLike | None = None,
+        thickness: ScalarLike | None = None,
     ):
         if (number is None) == (places is None):
             raise ValueError(
@@ -52,6 +56,9 @@ class Discs(Part):
                 f"Discs.mass: got shape {self.mass.shape}, need one mass or {self.size}, one for "
                 f"each disc"
             )
+        self.thickness = (
+            None if thickness is None else numbers("Discs.thickness", thickness, positive=True)
+        )
 
     @property
     def size(self) -> int:
@@ -67,6 +74,22 @@ class Discs(Part):
             return self.places
         length, size = real(length), self.size
         return length * jnp.arange(1, size + 1, dtype=length.dtype) / size
+
+    def faces(self, length: ScalarLike) -> Float[Array, " faces"]:
+        """Abscissas [m] of the ends of their holes, ascending: two for each disc with a thickness,
+        else one."""
+        X = self.along(length)
+        if self.thickness is None:
+            return X
+        return jnp.stack([X - self.thickness, X], axis=1).reshape(-1)
+
+    def stiffen(self, X: ArrayLike, length: ScalarLike) -> Array:
+        """Whether X [m], of any shape, lies between the faces of a disc with a thickness."""
+        X = real(X)
+        if self.thickness is None:
+            return jnp.zeros_like(X, bool)
+        behind = self.along(length) - X[..., None]
+        return jnp.any((behind >= 0) & (behind <= self.thickness), axis=-1)
 
 
 def _checked(places: VectorLike) -> Float[Array, " discs"]:

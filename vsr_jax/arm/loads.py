@@ -146,12 +146,14 @@ class Gravity(Load):
         return _force(weight, self.acceleration)
 
     def points(self, rod: Rod) -> tuple[tuple[Scalar, Wrench], ...]:
-        """The weights of the discs."""
+        """The weights of the discs, half of it at each face of those with a thickness."""
         discs = rod.discs
         if discs is None or discs.mass is None:
             return ()
-        X, mass = discs.along(rod.length), jnp.broadcast_to(discs.mass, (discs.size,))
-        return tuple((X[i], _force(mass[i], self.acceleration)) for i in range(discs.size))
+        X, mass = discs.faces(rod.length), jnp.broadcast_to(discs.mass, (discs.size,))
+        share = X.size // discs.size
+        mass = jnp.repeat(mass / share, share)
+        return tuple((X[i], _force(mass[i], self.acceleration)) for i in range(X.size))
 
 
 def _force(mass: Scalar, acceleration: Array) -> Wrench:

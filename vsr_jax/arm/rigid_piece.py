@@ -54,15 +54,6 @@ class RigidPiece(Part):
         return here if self.end is None else here & (self.end >= X)
 
 
-def flexibility(pieces: Sequence[RigidPiece], X: ArrayLike) -> Array | None:
-    """0 where X [m], of any shape, lies on a rigid piece and 1 elsewhere; None without pieces."""
-    if not pieces:
-        return None
-    X = real(X)
-    rigid = jnp.any(jnp.stack([piece.covers(X) for piece in pieces]), axis=0)
-    return jnp.where(rigid, jnp.zeros_like(X), jnp.ones_like(X))
-
-
 def check_pieces(name: str, pieces: Sequence[RigidPiece], length: float) -> None:
     """Raises `ValueError` for pieces of known numbers that are empty, beyond an arm of a known
     length or overlap, and if they leave nothing of it that bends."""

@@ -21,7 +21,7 @@ from .profile import (
     breakpoints_of,
     values_at,
 )
-from .rigid_piece import RigidPiece, flexibility
+from .rigid_piece import RigidPiece
 from .section import Section
 from .section_law import SectionLaw
 
@@ -108,9 +108,19 @@ class Rod(Part):
         return self.material.law(self.section, X, self.length)
 
     def flexible(self, X: ArrayLike) -> Array | None:
-        """0 where X [m], of any shape, lies on a rigid piece and 1 elsewhere; None without rigid
-        pieces."""
-        return flexibility(self.rigid, X)
+        """0 where X [m], of any shape, lies on a rigid piece or in a disc with a thickness and 1
+        elsewhere; None without these."""
+        if not self.stiffened:
+            return None
+        X = real(X)
+        here = [piece.covers(X) for piece in self.rigid]
+        here += [] if self.discs is None else [self.discs.stiffen(X, self.length)]
+        return jnp.where(jnp.any(jnp.stack(here), axis=0), jnp.zeros_like(X), jnp.ones_like(X))
+
+    @property
+    def stiffened(self) -> bool:
+        """Whether parts of the arm do not bend: rigid pieces, and discs with a thickness."""
+        return bool(self.rigid) or (self.discs is not None and self.discs.thickness is not None)
 
     def limits(self, X: ScalarLike) -> Limits:
         """Sizes, material properties and rest elongation at X [m] and their limits."""

@@ -172,7 +172,7 @@ class Scene(Part):
         names += [obstacle.effect for obstacle in self.obstacles]
         names += [option for effects in loads for option in effects[1:]]
         names += ["sections"] if self.breakpoints else []
-        names += ["rigid pieces"] if self.rod.rigid else []
+        names += ["rigid pieces"] if self.rod.stiffened else []
         names += [option for effects in threads for option in effects[1:]]
         if len(self.free_strains) < len(STRAINS):
             names.append("only " + ", ".join(self.free_strains))
@@ -234,12 +234,15 @@ class Scene(Part):
 
     @property
     def _acting_discs(self) -> tuple[Scalar, ...]:
-        """Abscissas [m] of the discs before the tip, where these are more than guides."""
+        """Abscissas [m] of the faces of discs before the tip, where these are more than guides."""
         discs = self.rod.discs
-        if discs is None or not (self.straight or (discs.mass is not None and self.loads)):
+        if discs is None:
             return ()
-        X = discs.along(self.rod.length)
-        return tuple(X[i] for i in range(discs.size if discs.number is None else discs.size - 1))
+        weighed = discs.mass is not None and bool(self.loads)
+        if not (self.straight or weighed or discs.thickness is not None):
+            return ()
+        X = discs.faces(self.rod.length)
+        return tuple(X[i] for i in range(X.size if discs.number is None else X.size - 1))
 
     def edges(self, more: Sequence[ScalarLike] = ()) -> Float[Array, " edges"]:
         """Ends of the smooth pieces of the arm [m], `more` breakpoints included."""

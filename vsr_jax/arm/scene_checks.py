@@ -13,7 +13,7 @@ from ..numerics.se3 import base_pose
 from ..typing import Scalar
 from ..validation import ROUNDING, concrete, is_traced, numbers
 from .actuator import Actuator
-from .discs import SAME
+from .discs import SAME, Discs
 from .held import Support
 from .loads import Load
 from .obstacles import Obstacle
@@ -83,17 +83,29 @@ def _check_places(
                 )
         if actuator.straight:
             _check_straight(f"Scene.actuators[{i}]", actuator, rod)
-    last = 0.0 if rod.discs is None else float(rod.discs.along(length)[-1])
-    if last > beyond:
-        raise ValueError(
-            f"Scene.rod.discs: got a disc at {last:g} m, need places on the arm of {length:g} m"
-        )
+    if rod.discs is not None:
+        _check_discs(rod.discs, length)
     for i, load in enumerate(loads):
         X = load.place(rod)
         if X is not None and float(X) > beyond:
             raise ValueError(
                 f"Scene.loads[{i}].X: got {float(X):g} m, need a place on the arm of {length:g} m"
             )
+
+
+def _check_discs(discs: Discs, length: float) -> None:
+    """Raises `ValueError` for a disc beyond an arm of a known length, or on another one."""
+    X = np.asarray(discs.along(length))
+    if X[-1] > length * (1 + ROUNDING):
+        raise ValueError(
+            f"Scene.rod.discs: got a disc at {X[-1]:g} m, need places on the arm of {length:g} m"
+        )
+    room = float(np.min(np.diff(X, prepend=0.0)))
+    if discs.thickness is not None and not float(discs.thickness) < room * (1 - ROUNDING):
+        raise ValueError(
+            f"Scene.rod.discs.thickness: got {float(discs.thickness):g} m, need less than the "
+            f"{room:g} m from disc to disc"
+        )
 
 
 def _check_straight(name: str, actuator: Actuator, rod: Rod) -> None:

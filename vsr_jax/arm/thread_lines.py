@@ -16,9 +16,10 @@ from .routing import thread_tangent
 
 
 def hole_places(rod: Rod) -> Float[Array, " places"]:
-    """Abscissas [m] of the holes of an arm with discs: at its base and in the discs."""
+    """Abscissas [m] of the ends of the holes of an arm with discs: at its base and at the faces of
+    the discs. In a disc with a thickness a straight tendon has a chord too, of constant length."""
     assert rod.discs is not None  # see `check_numbers`
-    return jnp.concatenate([jnp.zeros_like(rod.length)[None], rod.discs.along(rod.length)])
+    return jnp.concatenate([jnp.zeros_like(rod.length)[None], rod.discs.faces(rod.length)])
 
 
 def runs_between(rod: Rod, actuator: Actuator) -> Float[Array, " spans"]:

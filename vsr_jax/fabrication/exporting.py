@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..arm.scene import Scene
-from ..arm.thread_lines import hole_places
 from ..numerics.compiling import program
 from ..numerics.component import norm
 from ..solution.equilibrium import Equilibrium
@@ -231,8 +230,12 @@ def _given_bores(scene: Scene, bore: ArrayLike | None) -> Float[np.ndarray, " th
 def _places(scene: Scene, discs: VectorLike | None) -> Float[np.ndarray, " discs"]:
     length = float(scene.rod.length)
     if discs is None:
-        without = scene.rod.discs is None
-        return np.linspace(0.0, length, _DISCS) if without else np.asarray(hole_places(scene.rod))
+        own = scene.rod.discs
+        return (
+            np.linspace(0.0, length, _DISCS)
+            if own is None
+            else np.concatenate([[0.0], own.along(length)])
+        )
     if isinstance(discs, int | np.integer):
         return np.linspace(0.0, length, count("discs", discs, least=2))
     X = np.asarray(numbers("discs", discs, None), float)

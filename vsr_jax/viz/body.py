@@ -106,7 +106,7 @@ def body_of(eq: Equilibrium | Summary, stations: VectorLike = 60) -> Body:
         return Body(eq, None, None, None, np.zeros((0, 1, 3)), np.zeros(len(eq.X) - 1, bool))
     if np.ndim(eq.status) == 0 and not bool(eq.converged):
         return body_of(at_rest(eq), stations)._replace(failure=eq.message)
-    if (eq.scene.rod.rigid or eq.scene.rod.discs) and np.ndim(eq.status) == 0:
+    if (eq.scene.rod.stiffened or eq.scene.rod.discs) and np.ndim(eq.status) == 0:
         stations = with_parts(eq.scene, checked_stations(eq, stations, "stations"))
     return body_from_samples(eq, sample(eq, stations))
 
@@ -114,7 +114,7 @@ def body_of(eq: Equilibrium | Summary, stations: VectorLike = 60) -> Body:
 def with_parts(scene: Scene, X: Float[Array, " stations"]) -> Float[Array, " more"]:
     """Ascending stations [m], with the ends of rigid pieces and the discs."""
     parts = [x for piece in scene.rod.rigid for x in piece.breakpoints]
-    parts += [] if scene.rod.discs is None else [*scene.rod.discs.along(scene.rod.length)]
+    parts += [] if scene.rod.discs is None else [*scene.rod.discs.faces(scene.rod.length)]
     inside = [jnp.clip(x, X[0], X[-1]) for x in parts]
     return jnp.sort(jnp.concatenate([X, jnp.stack(inside)])) if inside else X
 
@@ -145,11 +145,11 @@ def thread_scales(bodies: Sequence[Body]) -> Scales:
 
 
 def _discs(eq: Equilibrium, samples: Summary) -> np.ndarray:
-    """Rims of the discs that guide the threads: shape (discs, angles, 3)."""
+    """Rims of the faces of the discs: shape (discs, angles, 3)."""
     rod, radius = eq.scene.rod, eq.scene.rod.rim
     if rod.discs is None or radius is None:
         return np.zeros((0, len(_ANGLES), 3))
-    places = np.asarray(rod.discs.along(rod.length))
+    places = np.asarray(rod.discs.faces(rod.length))
     chosen = np.unique(np.argmin(np.abs(samples.X - places[:, None]), axis=1))
     pose = np.asarray(samples.pose)[chosen]
     rim = float(radius) * np.stack([np.cos(_ANGLES), np.sin(_ANGLES)])
