@@ -49,6 +49,22 @@ def test_a_small_change_takes_fewer_steps(scene, near):
     agree(warm, cold)
 
 
+@pytest.mark.parametrize("loads", [(), vsr.Gravity((0.0, 0.0, -2.0))], ids=["bare", "gravity"])
+def test_a_control_loop_is_a_scan_of_three_steps_each(loads):
+    """Inputs change by half a percent from one solve to the next; the first one has no start."""
+    robot = vsr.Scene(arm().rod, arm().actuators, loads)
+    inputs = jnp.array([3.0, 1.5]) * (1 + 0.005 * jnp.arange(20.0)[:, None])
+
+    def following(eq, now):
+        eq = solved(robot, now, eq)
+        return eq, (eq.steps, eq.tip)
+
+    last, (steps, tips) = jax.lax.scan(following, solved(robot, inputs[0]), inputs[1:])
+    assert int(jnp.max(steps)) <= 3
+    np.testing.assert_array_equal(tips[-1], last.tip)
+    agree(last, solved(robot, inputs[-1]))
+
+
 @pytest.mark.slow
 def test_a_soft_arm_in_its_basin_takes_less_than_half_of_the_steps():
     paper_arm = paper.scene("B1")

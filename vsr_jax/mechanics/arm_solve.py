@@ -93,7 +93,9 @@ def solve_arm(
             return Root(found, yes, yes, jnp.array(0, jnp.int32))
         root = side_by_side(partial(_solve, free), _QUEUED)(_start(problem, free), guess, problem)
         point = root.x._replace(xi=free_components(root.x.xi, free))
-        return root._replace(x=point, restarted=None if guess is None else root.restarted)
+        # as from a guess, so that a solve without one begins a scan of those from the last
+        restarted = jnp.zeros_like(root.restarted) if guess is None else root.restarted
+        return root._replace(x=point, restarted=restarted)
 
     def whole(x: ArmUnknown, problem: ArmProblem) -> ArmUnknown:
         return x._replace(xi=completed(x.xi, problem.sections, free))
