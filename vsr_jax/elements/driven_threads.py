@@ -229,9 +229,9 @@ def driven_of(
     stiffness = actuator.cable_stiffness
     rest = thread_length(scene, sections.rest, sections, place, grid)
     compliance = None if stiffness is None else 1 / stiffness
-    scale = largest_force_scale(sections) / scene.rod.length
     free = actuator.free_length(rest, value)
     yields = _compliance_of_arm(sections, place, grid)
+    scale = 1 / (yields + scene.rod.length / largest_force_scale(sections))
     return Driven(actuator, value, rest, free, compliance, scale, yields, jnp.zeros_like(scale))
 
 

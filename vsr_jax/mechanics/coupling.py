@@ -163,6 +163,11 @@ class ArmProblem(NamedTuple):
         return any(coupling.follows_rate for coupling in self.couplings)
 
     @property
+    def remembers(self) -> bool:
+        """Whether a coupling goes on from a solution before."""
+        return any(coupling.remembers for coupling in self.couplings)
+
+    @property
     def dissipates(self) -> Array | None:
         """Whether the tangent of a constraint is not symmetric; None if never."""
         each = [x for one in self.constraints if (x := one.dissipates()) is not None]
@@ -279,6 +284,11 @@ class Coupling(eqx.Module):
         """The coupling with rows whose derivative takes longer to find, and less to apply many
         times; the same by default."""
         return self
+
+    @property
+    def remembers(self) -> bool:
+        """Whether it has the memory of a solution before it; never by default."""
+        return False
 
     def after(self, x: PyTree, at: ArmState, problem: ArmProblem) -> "Coupling":
         """The coupling with the memory of a solution before it; the same by default."""
