@@ -7,12 +7,13 @@ cable of the free length $l^* + \delta$ is
 
 $$\min(T, k_0 s) = 0, \quad s = (l^* + \delta)(1 + T / k) - l,$$
 
-the complementarity of tension and slack, where the stiffness $k_0$ [N/m] only scales the two.
-
-On the way to a solution that Newton's method does not find at once, a spring in series with each
-thread becomes stiffer step by step. Without it, three taut cables that pull against each other make
-one another slack in turn, without end (`test_three_lengths_that_pull_against_each_other` in
+the complementarity of tension and slack, where the stiffness $k_0$ [N/m] only scales the two. It
+is that of the arm at rest along the thread: with a stiffer one Newton's method takes threads for
+slack when the arm has not followed yet (`test_lengths_that_rub_start_from_one_another` in
 tests/test_discs.py).
+
+On the way to a solution that Newton's method does not find at once, the changes of length
+$\delta$ come by increments, as the loads do.
 """
 
 from typing import NamedTuple
@@ -37,18 +38,15 @@ from ..numerics.stacked import stack
 from ..typing import Scalar
 from .chords import chords_of, pull_on
 
-_HARDER = 1e3
-"""Factor by which the springs at threads harden on the way, before they are rigid."""
-
 
 class Driven(NamedTuple):
     r"""A thread with a law.
 
     **Fields:** its `actuator` and `input`; the length [m] of its path at `rest`, and that of the
     unstretched thread, `free`; its compliance $1/k$ [1/N], None if it cannot be stretched; a
-    stiffness $k_0$ [N/m] that scales lengths to forces; by how much its path `yields` [m/N] to
-    a tension at rest; `idle`: 1 where it exerts no force, whatever its law; compliance of a spring
-    in series with it, `soft` [m/N], None for none.
+    stiffness $k_0$ [N/m] that scales lengths to forces; `idle`: 1 where it exerts no force,
+    whatever its law; `missing`: what has not come yet of the change of its free length [m], None
+    for nothing.
     """
 
     actuator: Actuator
@@ -57,13 +55,13 @@ class Driven(NamedTuple):
     free: Array
     compliance: Array | None
     scale: Array
-    yields: Array
     idle: Array
-    soft: Array | None = None
+    missing: Array | None = None
 
     def law(self, tension: Array, path: Array, share: Array | None, grid: Grid) -> "Law":
         """The law at a tension, a length of the path and a share of the tension along it."""
-        length = path - tension * self._gives(share, grid)
+        length = path - tension * self.stretch(share, grid)
+        length = length if self.missing is None else length + self.missing
         given = self.actuator, self.input, self.rest, self.scale, -tension, length
         arms = jnp.broadcast_shapes(tension.shape, path.shape)
         found = of_each_arm(_law_and_slopes, arms, *given)
@@ -73,7 +71,7 @@ class Driven(NamedTuple):
     def gives(self, law: "Law", gain: Array | None, grid: Grid) -> Array:
         """Derivative of the law by the tension at a given length of the path, with the stretch by
         the `gain` of the tension along it."""
-        return law.by_tension - law.by_length * self._gives(gain, grid)
+        return law.by_tension - law.by_length * self.stretch(gain, grid)
 
     def slack(self, tension: Array, path: Array, share: Array | None, grid: Grid) -> Array:
         """Slack on a path of a given length [m], negative if the thread is too short."""
@@ -89,11 +87,6 @@ class Driven(NamedTuple):
         reached = jnp.sum(jnp.where(share > 0, grid.weight, 0.0), axis=(0, 1))
         mean = jnp.sum(grid.weight * share, axis=(0, 1)) / reached
         return self.free * self.compliance * mean
-
-    def _gives(self, share: Array | None, grid: Grid) -> Array:
-        """Stretch per unit of the tension, with that of the spring."""
-        stretch = self.stretch(share, grid)
-        return stretch if self.soft is None else stretch + self.soft
 
 
 class Law(NamedTuple):
@@ -120,16 +113,15 @@ class DrivenThreads(ThreadRule):
 
     places: tuple[int, ...] = eqx.field(static=True)
     threads: tuple[Driven, ...]
-    hardens = True
+    by_increments = True
 
     def relaxed(self) -> "DrivenThreads":
         """Threads without force."""
         idle = (one._replace(idle=jnp.ones_like(one.idle)) for one in finite(self.threads))
         return DrivenThreads(self.places, tuple(idle))
 
-    def softened(self, hardness: Array) -> "DrivenThreads":
-        soft = (1 - hardness) * _HARDER ** (-hardness)
-        found = (one._replace(soft=soft * one.yields) for one in self.threads)
+    def scaled(self, share: Array) -> "DrivenThreads":
+        found = (one._replace(missing=(1 - share) * (one.free - one.rest)) for one in self.threads)
         return DrivenThreads(self.places, tuple(found))
 
     def guess(self, forces: Forces, grid: Grid) -> Float[Array, "threads ..."]:
@@ -230,9 +222,9 @@ def driven_of(
     rest = thread_length(scene, sections.rest, sections, place, grid)
     compliance = None if stiffness is None else 1 / stiffness
     free = actuator.free_length(rest, value)
-    yields = _compliance_of_arm(sections, place, grid)
-    scale = 1 / (yields + scene.rod.length / largest_force_scale(sections))
-    return Driven(actuator, value, rest, free, compliance, scale, yields, jnp.zeros_like(scale))
+    axial = scene.rod.length / largest_force_scale(sections)
+    scale = 1 / (axial + _compliance_of_arm(sections, place, grid))
+    return Driven(actuator, value, rest, free, compliance, scale, jnp.zeros_like(scale))
 
 
 def _compliance_of_arm(sections: CrossSections, place: int, grid: Grid) -> Array:

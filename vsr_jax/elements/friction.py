@@ -145,10 +145,6 @@ class Friction(ThreadRule):
             slopes[place] = slope
         return tuple(slopes)
 
-    @property
-    def remembers(self) -> bool:
-        return self.memory is not None
-
     def after(self, x: Vector, at: ArmState, problem: ArmProblem) -> "Friction":
         slopes = self._slopes(x, at)
         memory = tuple(Memory(-at.tau[place], -slopes[place]) for place in self.places)

@@ -121,10 +121,6 @@ class HoleFriction(ThreadRule):
         decay = self.coefficients[i] * jnp.cumsum(x, axis=0)
         return share_of(tension, decay, None if self.memory is None else self.memory[i])
 
-    @property
-    def remembers(self) -> bool:
-        return self.memory is not None
-
     def after(self, x: Vector, at: ArmState, problem: ArmProblem) -> "HoleFriction":
         assert at.along is not None  # such tendons are loads
         forces = at.along.pose.forces

@@ -300,7 +300,7 @@ def _iteration(
 
     def evaluate(point: _Point, damping: Array, stage: Stage) -> Damped:
         problem = whole.loosened(stage.loose)
-        problem = problem.with_share(stage.share, hardens=schedule.stages > 0)
+        problem = problem.with_share(stage.share)
         if whole.constrained and (guess is None or not whole.begins_soft):
             bent = stage.loose if whole.begins_soft else stage.restarted
             soft = jnp.clip(2.0 - stage.share, 0.0, 1.0)
@@ -338,19 +338,13 @@ def _iteration(
 
 
 def schedule_of(problem: ArmProblem, guess: ArmUnknown | None = None) -> Schedule:
-    """Load increments and stages of a problem that begins from a guess or from rest.
-
-    Cables of given length that rub have no energy. Springs in series with them lead from rest, but
-    not to forces that go on from those before: paths of six such cables take a fifth of the
-    evaluations without (`test_lengths_that_rub_along_a_path` in tests/test_discs.py).
-    """
-    loaded = problem.loads is not None and not problem.begins_soft
-    energy = problem.constrained or not problem.follows_rate
-    hardens = problem.hardens and (energy or not problem.remembers)
+    """Load increments and stages of a problem that begins from a guess or from rest."""
+    begins_whole = not problem.begins_soft
+    loaded = begins_whole and problem.by_increments
     return Schedule(
         LOAD_INCREMENTS if loaded else 1,
-        HARDENING_STAGES if hardens else 0,
-        SOFT_STAGES if problem.constrained else HARDENING_STAGES,
-        direct=guess is not None or loaded or (hardens and not problem.begins_soft),
+        HARDENING_STAGES if problem.constrained else 0,
+        SOFT_STAGES,
+        direct=guess is not None or loaded or (begins_whole and problem.constrained),
         damping=0.0 if guess is not None or loaded else FIRST_DAMPING,
     )

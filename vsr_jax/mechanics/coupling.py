@@ -62,18 +62,13 @@ class ArmProblem(NamedTuple):
     loads: Loading | None
     couplings: tuple["Coupling", ...]
 
-    def with_share(self, share: Array, *, hardens: bool) -> "ArmProblem":
-        """The problem with a fraction of its loads. What hardens, if that is a part of the way, is
-        soft up to the fraction 1, with all loads; above it, it hardens up to 2, where it is
-        exact."""
-        problem = self
-        if hardens:
-            hardness, share = jnp.maximum(share - 1.0, 0.0), jnp.minimum(share, 1.0)
-            softer = tuple(one.softened(hardness) for one in self.couplings)
-            problem = self._replace(couplings=softer)
-        if problem.loads is None:
-            return problem
-        return problem._replace(loads=problem.loads.scaled(share))
+    def with_share(self, share: Array) -> "ArmProblem":
+        """The problem with a fraction of what comes `by_increments`. Constraints are soft up to the
+        fraction 1; above it, they harden up to 2, where they are exact."""
+        hardness, share = jnp.maximum(share - 1.0, 0.0), jnp.minimum(share, 1.0)
+        couplings = tuple(one.scaled(share).softened(hardness) for one in self.couplings)
+        loads = None if self.loads is None else self.loads.scaled(share)
+        return self._replace(loads=loads, couplings=couplings)
 
     def loosened(self, loose: Array | None) -> "ArmProblem":
         """The problem that is solved where the given one is not, where `loose` is true."""
@@ -147,9 +142,9 @@ class ArmProblem(NamedTuple):
         return bool(self.constraints)
 
     @property
-    def hardens(self) -> bool:
-        """Whether couplings can be softer on the way to a solution."""
-        return any(one.hardens for one in self.couplings)
+    def by_increments(self) -> bool:
+        """Whether loads or couplings can come by increments."""
+        return self.loads is not None or any(one.by_increments for one in self.couplings)
 
     @property
     def begins_soft(self) -> bool:
@@ -161,11 +156,6 @@ class ArmProblem(NamedTuple):
         """Whether a coupling follows the strain and its derivative along the arm: the tangent lacks
         what that does to the forces, so that Newton's method converges linearly."""
         return any(coupling.follows_rate for coupling in self.couplings)
-
-    @property
-    def remembers(self) -> bool:
-        """Whether a coupling goes on from a solution before."""
-        return any(coupling.remembers for coupling in self.couplings)
 
     @property
     def dissipates(self) -> Array | None:
@@ -230,8 +220,8 @@ class Coupling(eqx.Module):
 
     follows_rate: ClassVar[bool] = False
     """Whether the strain and its derivative along the arm give its unknowns."""
-    hardens: ClassVar[bool] = False
-    """Whether it is softer on the way to a solution."""
+    by_increments: ClassVar[bool] = False
+    """Whether it can come by increments on the way to a solution."""
 
     @abstractmethod
     def guess(self, forces: Forces, grid: Grid) -> PyTree:
@@ -275,6 +265,10 @@ class Coupling(eqx.Module):
         \xi^*)'$ along the arm, which models with a basis know."""
         raise NotImplementedError
 
+    def scaled(self, share: Array) -> "Coupling":
+        """A fraction of it, where it comes `by_increments`; the same by default."""
+        return self
+
     def softened(self, hardness: Array) -> "Coupling":
         """The coupling with springs in its place or beside it, from `hardness` 0 up to 1, where it
         is exact; the same by default."""
@@ -284,11 +278,6 @@ class Coupling(eqx.Module):
         """The coupling with rows whose derivative takes longer to find, and less to apply many
         times; the same by default."""
         return self
-
-    @property
-    def remembers(self) -> bool:
-        """Whether it has the memory of a solution before it; never by default."""
-        return False
 
     def after(self, x: PyTree, at: ArmState, problem: ArmProblem) -> "Coupling":
         """The coupling with the memory of a solution before it; the same by default."""
@@ -340,7 +329,6 @@ class Constraint(Coupling):
     """A constraint on the shape of the arm. Its unknowns are forces. On the way to a solution
     springs stand in its place, whose energy shows whether a step is an advance."""
 
-    hardens = True
     begins_soft: ClassVar[bool] = False
     """Whether a solve from rest begins with springs: the exact constraint seldom leads from there
     to a solution."""

@@ -276,7 +276,7 @@ def _solve(basis: NodalBasis, problem: ArmProblem) -> Root:
     elastic, schedule = c.single(lu.diagonal(K)), schedule_of(problem)
 
     def evaluate(unknown: GalerkinUnknown, damping: Array, stage: Stage) -> Damped:
-        part = problem.with_share(stage.share, hardens=schedule.stages > 0)
+        part = problem.with_share(stage.share)
         at = state_of(unknown, basis, part)
         r = imbalance(unknown, at, basis, part)
         J = approximate_tangent(unknown, at, basis, part)

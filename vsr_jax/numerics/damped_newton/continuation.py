@@ -27,7 +27,7 @@ _SETTLED = 0.3
 """Norm of an undamped step, or angle [rad] by which it turns the arm, below which the next stage
 begins."""
 _DIRECT = 30
-"""Bound on the evaluations of a direct attempt where there are stages."""
+"""Bound on the evaluations of a direct attempt."""
 _SLIDING, _CLOSE = 20, 1e-3
 """The same where something slides with friction, and norm of a step below which the attempt may
 take twice as many."""
@@ -151,18 +151,17 @@ def fails(
     (`test_an_arm_that_would_snap_aside_is_found_aside` in tests/test_contact_tube.py).
     """
     if setting.schedule.direct:
-        return _direct_fails(state, trial, verdict, setting.schedule)
+        return _direct_fails(state, trial, verdict)
     assert busy is not None
     unsolved = ~busy & ~(probe.stable(state) & termination.converged(state, setting))
     return unsolved | (state.evaluations >= _FIRST_STAGES)
 
 
-def _direct_fails(state: State, trial: Trial, verdict: Verdict, schedule: Schedule) -> Array:
+def _direct_fails(state: State, trial: Trial, verdict: Verdict) -> Array:
     """Which direct attempts fail: at the first step that is not accepted, at the first tangent that
-    is not positive definite, or as unstable; where something slides or there are stages, after some
-    evaluations.
+    is not positive definite, as unstable, or after some evaluations.
 
-    Without the bound where there are stages, three cables that make each other slack in turn do so
+    Without that bound, three cables that make each other slack in turn do so
     without end (`test_lengths_of_a_shape_give_back_its_tensions` in tests/test_discs.py).
 
     Where an indefinite tangent is damped instead, the hard arms of `TABLE` in
@@ -175,8 +174,7 @@ def _direct_fails(state: State, trial: Trial, verdict: Verdict, schedule: Schedu
         stopped = stopped | trial.new.out
     failed = jnp.where(trial.solving, stopped, probe.unstable(state.probe))
     if verdict.sliding is None:
-        late = trial.solving & (state.evaluations > _DIRECT)
-        return failed | late if schedule.stages else failed
+        return failed | (trial.solving & (state.evaluations > _DIRECT))
     most = jnp.where(state.local.step_norm < _CLOSE, 2 * _SLIDING, _SLIDING)
     late = trial.solving & (state.evaluations > most)
     return (failed & ~(trial.solving & verdict.sliding)) | late

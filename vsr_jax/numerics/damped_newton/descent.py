@@ -36,9 +36,12 @@ def next_step(
     one is halved: without, three of 64 arms in straight tubes are not solved
     (benchmarks/contact_search.py --tubes 64 --steps 12).
     """
-    last, fraction = trial.step, _extrapolation(trial, found, setting.tolerance)
+    last, dot = trial.step, setting.measures.dot
+    fraction = trial.probing.astype(found.work.dtype)  # a probe sums up its steps
+    if dot is None:
+        fraction = jnp.maximum(fraction, _extrapolation(trial, found, setting.tolerance))
+    fraction = once(fraction)
     step = jax.tree.map(lambda s, last: s + fraction.astype(s.dtype) * last, trial.new.step, last)
-    dot = setting.measures.dot
     if dot is not None:
         if setting.schedule.stages:
             back = dot(step, last) < -0.5 * dot(last, last)
@@ -55,7 +58,7 @@ def next_step(
 
 
 def _extrapolation(trial: Trial, found: Contraction, tolerance: Tolerance) -> Array:
-    r"""Fraction of the last step to take again. A probe sums up its steps.
+    r"""Fraction of the last step to take again, where there is an energy.
 
     The tangent may be approximate. Where it is much too stiff for a soft motion of the arm, the
     residual along a full step contracts only by $\rho$ near 1, and $\rho^2 / (1 - \rho)$ of the
@@ -64,8 +67,7 @@ def _extrapolation(trial: Trial, found: Contraction, tolerance: Tolerance) -> Ar
     """
     rho = jnp.clip(jnp.minimum(found.work, found.steps), 0.0, MAX_CONTRACTION)
     slow = found.full & (trial.new.merit > 4 * tolerance.rounding) & (rho > _MIN_CONTRACTION)
-    fraction = jnp.where(slow, rho**2 / (1 - rho), 0.0)
-    return once(jnp.where(trial.probing, 1.0, jnp.where(trial.without_energy, 0.0, fraction)))
+    return jnp.where(slow & ~trial.probing, rho**2 / (1 - rho), 0.0)
 
 
 def finished(trial: Trial, last: Array) -> Any:
