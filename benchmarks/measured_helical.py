@@ -10,7 +10,6 @@ For each model: root mean square distances of the markers, fitted and of the ste
 import argparse
 import csv
 import json
-import time
 from pathlib import Path
 from typing import Any
 
@@ -103,18 +102,21 @@ def arm(*, straight: bool = True, thick: bool = True) -> vsr.Scene:
     return vsr.Scene(wire, tendons, [vsr.Gravity((0.0, 0.0, 9.81))])
 
 
-def measurements(scene: vsr.Scene) -> vsr.Measurements:
-    """The trial; the markers are where they are if the arm stands upright at step 0 below them."""
-    seen = measured()
+def offsets(scene: vsr.Scene) -> np.ndarray:
+    """Places (markers, 3) [m] on the last disc, if the arm stands upright at step 0."""
     base = np.asarray(scene.rod.base)
-    offset = (seen[0] - base[:3, 3]) @ base[:3, :3] - [LENGTH, 0.0, 0.0]
-    markers = vsr.Markers(seen, X=[LENGTH] * 2, offset=offset, sd=SD, labels=["p1", "p2"])
+    return (measured()[0] - base[:3, 3]) @ base[:3, :3] - [LENGTH, 0.0, 0.0]
+
+
+def measurements(scene: vsr.Scene) -> vsr.Measurements:
+    """The trial, with markers at `offsets`."""
+    seen, X = measured(), [LENGTH] * 2
+    markers = vsr.Markers(seen, X=X, offset=offsets(scene), sd=SD, labels=["p1", "p2"])
     return vsr.Measurements(np.linspace(0, 1, len(seen))[:, None] * COMMAND, markers)
 
 
-def unknowns(data: vsr.Measurements) -> dict[str, vsr.Unknown]:
-    """Modulus, zeros of the motors, base, markers; `NUMBERS` are fixed."""
-    offset = np.asarray(data.observations[0].offset)
+def unknowns(offset: np.ndarray) -> dict[str, vsr.Unknown]:
+    """Modulus, zeros of the motors, base, markers near an `offset`; `NUMBERS` are fixed."""
     free = {
         "rod.material.young": vsr.Unknown(5e8, 1e10, prior=(YOUNG, 5e8)),
         "inputs.offset": vsr.Unknown(-3e-3, 3e-3, prior=(0.0, 1e-3)),
@@ -129,9 +131,8 @@ def unknowns(data: vsr.Measurements) -> dict[str, vsr.Unknown]:
 
 def fitted(scene: vsr.Scene, changes: dict[str, float] | None = None) -> vsr.Fit:
     """The fit of a scene, with numbers fixed at other values."""
-    data = measurements(scene)
-    free = unknowns(data) | {k: vsr.Unknown(v, v) for k, v in (changes or {}).items()}
-    return vsr.fit(scene, free, data, model=MODEL, progress=False)
+    free = unknowns(offsets(scene)) | {k: vsr.Unknown(v, v) for k, v in (changes or {}).items()}
+    return vsr.fit(scene, free, measurements(scene), model=MODEL, progress=False)
 
 
 def record_of(fit: vsr.Fit) -> dict[str, Any]:
@@ -163,10 +164,8 @@ def main() -> None:
             Path(options.json).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
 
     for name, changes in MODELS.items():
-        start = time.perf_counter()
         fit = fitted(arm(), changes)
-        seconds = {} if changes else {"seconds with compiling": time.perf_counter() - start}
-        write(name, record_of(fit) | seconds)
+        write(name, record_of(fit))
         if not changes:
             print(fit)
             numbers = fit.numbers.items()

@@ -3,10 +3,9 @@ elimination.
 
 In a batch of arms a pass over all hinges from the tip to the base keeps the change of the wrench
 beyond each as an affine function of the motion, $\hat Q z + q$, and one from the base to the tip
-gives the motions.
+gives the motions. Stiffness across spans of steps adds a force to that (see `spans`).
 
-One arm would wait for many small operations in that, and stiffness across spans of steps (`spans`)
-needs both ends of each. There the hinges are put together step by step, all steps at once: by the
+One arm would wait for many small operations in that. There the hinges are put together step by step, all steps at once: by the
 same pass over the hinges of a step, with the wrench beyond its end, $W_1$, as further unknowns.
 With the motions $z_0, z_1$ at both ends of a step, which are before its first hinge and that of the
 next step here,
@@ -36,7 +35,7 @@ from ..numerics.once import once
 from ..numerics.quadrature import Grid
 from ..numerics.stacked import affine, columns, matmul, product, rows, transpose
 from .definiteness import asymmetry_of
-from .hinges import Hinge, before, behind, halves, solved
+from .hinges import Hinge, before, behind, halves, motion_behind, solved
 from .nodes import at_node, by_place, places_of
 from .spans import SpanStiffness
 
@@ -97,28 +96,66 @@ def _stiffness(hinge: Hinge, change: Array) -> Array:
 
 
 def solved_by_hinges(
-    hinges: Hinge, grid: Grid, free: tuple[int, ...]
+    hinges: Hinge, grid: Grid, free: tuple[int, ...], spans: SpanStiffness | None = None
 ) -> tuple[Array, Array, Array]:
-    """Strains in the world frame (size, sides, stages, steps, *arms), numbers of negative pivots
-    and asymmetries, by passes over all hinges."""
-    arms, width = hinges.width.shape[2:], hinges.given.shape[1]
-    none = jnp.zeros((3, width, *arms), hinges.width.dtype)
-    places = places_of(grid)
+    r"""Strains in the world frame (size, sides, stages, steps, *arms), numbers of negative pivots
+    and asymmetries, by passes over the steps and over the hinges of each.
 
-    def backward(end: tuple[Array, Array], place: tuple[Array, Array]) -> tuple[tuple, tuple]:
-        start, (X, negative, compliance, Q) = before(free, end, at_node(hinges, place, len(arms)))
-        return start, (X, negative, asymmetry_of(Q, None, compliance))
+    With stiffness across spans about the hinges, all depends on the force $\phi$ too, and the
+    motion of the section at the end of its span is kept beside the wrench (see `spans`)."""
+    (stages, steps), arms = hinges.width.shape[:2], hinges.width.shape[2:]
+    width, first = hinges.given.shape[1], 6 if spans is None else 12
+    none = jnp.zeros((6, width, *arms), hinges.width.dtype)
+    still = jnp.eye(6, width, dtype=none.dtype).reshape(6, width, *(1,) * len(arms))
+    every = jnp.arange(steps), jnp.arange(stages)
 
-    _, (X, negative, asymmetry) = scan(backward, (none, none), places, reverse=True)
+    def hinge_before(beyond: tuple, place: tuple[Array, Array]) -> tuple[tuple, tuple]:
+        end, ends = beyond
+        hinge = at_node(hinges, place, len(arms))
+        start, (X, negative, compliance, Q) = before(free, end, hinge)
+        if ends is not None:
+            ahead = motion_behind(still, X, hinge.link, hinge.width)
+            further = _padded(columns(ends, 6, width), 6)
+            ends = once(product(columns(ends, 0, 6), ahead) + further)
+        return (start, ends), (X, negative, asymmetry_of(Q, None, compliance))
 
-    def forward(z: Array, hinge: tuple) -> tuple[Array, Array]:
-        X = once(hinge[0])
-        link, w = at_node((hinges.link, hinges.width), hinge[1], len(arms))
-        return behind(z, link, w, columns(X, 0, 6), columns(X, 6, width))
+    def backward(beyond: tuple, step: Array) -> tuple[tuple, tuple]:
+        span = at_node(spans, (step,), len(arms))
+        if span is not None:
+            wrench, ends = span.closing(jnp.concatenate(beyond[0]), beyond[1])
+            beyond = halves(wrench), ends
+        places = every[1], jnp.full_like(every[1], step)
+        beyond, found = scan(hinge_before, beyond, places, reverse=True)
+        if span is not None:
+            wrench, ends = span.opening(jnp.concatenate(beyond[0]), beyond[1])
+            beyond = halves(wrench), ends
+        return beyond, found
 
-    start = jnp.zeros((6, width - 6, *arms), X.dtype)
-    _, strain = scan(forward, start, (X, places))
-    return by_place(jnp.moveaxis(strain, 0, 2), grid, len(arms)), negative, asymmetry
+    tip = halves(none), None if spans is None else none
+    _, (X, negative, asymmetry) = scan(backward, tip, every[0], reverse=True)
+
+    def forward(base: tuple, now: tuple) -> tuple[tuple, Array]:
+        (z, force), (X, step) = base, now
+        if spans is not None:
+            force = at_node(spans, (step,), len(arms)).force(z, force)
+
+        def hinge_behind(z: Array, hinge: tuple) -> tuple[Array, Array]:
+            X, stage = once(hinge[0]), hinge[1]
+            link, w = at_node((hinges.link, hinges.width), (stage, step), len(arms))
+            others = columns(X, first, width)
+            if force is not None:
+                others = others + product(columns(X, 6, 12), force)
+            return behind(z, link, w, columns(X, 0, 6), others)
+
+        z, strain = scan(hinge_behind, z, (X, every[1]))
+        return (z, force), strain
+
+    start = columns(none, first, width)
+    base = start, None if spans is None else start
+    _, strain = scan(forward, base, (X, every[0]))
+    strain = jnp.moveaxis(strain, (0, 1), (3, 2))
+    negative, asymmetry = (x.reshape(-1, *arms) for x in (negative, asymmetry))
+    return strain, negative, asymmetry
 
 
 def solved_by_joints(

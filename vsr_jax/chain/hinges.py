@@ -195,11 +195,16 @@ def behind(
     r"""The motions before the next hinge and the strains of one, from the motions (6, n) before it,
     X (size, 6) and `others` (size, n): $X z + x$, with the motion z before the hinge."""
     strain = once(product(X, motion) + others)
+    return motion_behind(motion, strain, link, width), strain
+
+
+def motion_behind(motion: Array, strain: Array, link: Array, width: Array) -> Array:
+    """The motions before the next hinge from those before a hinge and its strains, all (..., n)."""
     turn = once(rows(motion, 0, 3) + width * rows(strain, 0, 3))
     shift = rows(motion, 3, 6) + cross(turn, link[:, None])
     if len(strain) == 6:
         shift = shift + width * rows(strain, 3, 6)
-    return once(jnp.concatenate([turn, shift])), strain
+    return once(jnp.concatenate([turn, shift]))
 
 
 def _pivot(

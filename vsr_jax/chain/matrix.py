@@ -70,12 +70,11 @@ class Chain(NamedTuple):
         # by steps, single precision loses signs of pivots of a limp arm under tension, for which a
         # step without what lies beyond it is indefinite
         limp = push is not None and b.dtype == jnp.float32
-        if coupled.spans is None and (apart or b.ndim > 4 or limp):
-            hinges = self._hinges(coupled, b, push, 0)
-            passed = solved_by_hinges(hinges, self.grid, self.free)
-        else:
-            hinges, spans = self._hinges(coupled, b, push, 6), self._spans(coupled, b)
-            passed = solved_by_joints(hinges, self.grid, self.free, spans)
+        by_hinges, spans = apart or b.ndim > 4 or limp, self._spans(coupled, b)
+        unknowns = 0 if by_hinges and spans is None else 6
+        hinges = self._hinges(coupled, b, push, unknowns)
+        solved = solved_by_hinges if by_hinges else solved_by_joints
+        passed = solved(hinges, self.grid, self.free, spans)
         strain, negative, asymmetry = passed
         found = self._free_part(self._turned(transpose(coupled.rotation), strain))
         return found, definiteness(negative, asymmetry, self.grid)
