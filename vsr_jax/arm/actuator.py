@@ -19,7 +19,8 @@ class ThreadState(NamedTuple):
 
     **Fields:** the signed `force` $\\tau$ [N] at the start of the thread; the `length` [m] of its
     path, less what the thread itself stretches; the length of the path of the arm at `rest` [m];
-    `scale` [N/m]: the axial stiffness $EA / L$ of the arm, by which lengths compare to forces.
+    `scale` [N/m]: the stiffness of the arm at rest along the thread, by which lengths compare to
+    forces.
     """
 
     force: Scalar
