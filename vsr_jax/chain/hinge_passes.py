@@ -5,8 +5,9 @@ In a batch of arms a pass over all hinges from the tip to the base keeps the cha
 beyond each as an affine function of the motion, $\hat Q z + q$, and one from the base to the tip
 gives the motions. Stiffness across spans of steps adds a force to that (see `spans`).
 
-One arm would wait for many small operations in that. There the hinges are put together step by step, all steps at once: by the
-same pass over the hinges of a step, with the wrench beyond its end, $W_1$, as further unknowns.
+One arm would wait for many small operations in that. There the hinges are put together step by
+step, all steps at once: by the same pass over the hinges of a step, with the wrench beyond its end,
+$W_1$, as further unknowns.
 With the motions $z_0, z_1$ at both ends of a step, which are before its first hinge and that of the
 next step here,
 
