@@ -561,6 +561,7 @@ def test_lengths_that_rub_start_from_one_another():
     np.testing.assert_allclose(found.tip, expected.tip, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_lengths_that_rub_along_a_path():
     """Six cables that bend an arm there and back, in 26 samples."""
     robot = bench_discs.robot(True, "length")

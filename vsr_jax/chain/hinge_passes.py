@@ -7,9 +7,8 @@ gives the motions. Stiffness across spans of steps adds a force to that (see `sp
 
 One arm would wait for many small operations in that. There the hinges are put together step by
 step, all steps at once: by the same pass over the hinges of a step, with the wrench beyond its end,
-$W_1$, as further unknowns.
-With the motions $z_0, z_1$ at both ends of a step, which are before its first hinge and that of the
-next step here,
+$W_1$, as further unknowns. With the motions $z_0, z_1$ at both ends of a step, which are before its
+first hinge and that of the next step here,
 
 $$z_1 = T z_0 + F W_1 + f, \quad W_0 = S z_0 + G W_1 + s.$$
 
@@ -24,6 +23,7 @@ of S, count with those of the hinges. The strains in a step follow from $z_0$ an
 small difference of large forces where a stiff contact is near, they would be less exact.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -104,36 +104,35 @@ def solved_by_hinges(
 
     With stiffness across spans about the hinges, all depends on the force $\phi$ too, and the
     motion of the section at the end of its span is kept beside the wrench (see `spans`)."""
-    (stages, steps), arms = hinges.width.shape[:2], hinges.width.shape[2:]
+    (stages, steps), arms = grid.X.shape[:2], hinges.width.shape[2:]
     width, first = hinges.given.shape[1], 6 if spans is None else 12
     none = jnp.zeros((6, width, *arms), hinges.width.dtype)
-    still = jnp.eye(6, width, dtype=none.dtype).reshape(6, width, *(1,) * len(arms))
-    every = jnp.arange(steps), jnp.arange(stages)
+    motion = jnp.eye(6, width, dtype=none.dtype).reshape(6, width, *(1,) * len(arms))
+    every_step, every_stage = jnp.arange(steps), jnp.arange(stages)
 
     def hinge_before(beyond: tuple, place: tuple[Array, Array]) -> tuple[tuple, tuple]:
         end, ends = beyond
         hinge = at_node(hinges, place, len(arms))
         start, (X, negative, compliance, Q) = before(free, end, hinge)
         if ends is not None:
-            ahead = motion_behind(still, X, hinge.link, hinge.width)
+            ahead = motion_behind(motion, X, hinge.link, hinge.width)
             further = _padded(columns(ends, 6, width), 6)
             ends = once(product(columns(ends, 0, 6), ahead) + further)
         return (start, ends), (X, negative, asymmetry_of(Q, None, compliance))
 
+    def at_end(change: Callable, beyond: tuple) -> tuple:
+        wrench, ends = change(jnp.concatenate(beyond[0]), beyond[1])
+        return halves(wrench), ends
+
     def backward(beyond: tuple, step: Array) -> tuple[tuple, tuple]:
         span = at_node(spans, (step,), len(arms))
-        if span is not None:
-            wrench, ends = span.closing(jnp.concatenate(beyond[0]), beyond[1])
-            beyond = halves(wrench), ends
-        places = every[1], jnp.full_like(every[1], step)
+        beyond = beyond if span is None else at_end(span.closing, beyond)
+        places = every_stage, jnp.full_like(every_stage, step)
         beyond, found = scan(hinge_before, beyond, places, reverse=True)
-        if span is not None:
-            wrench, ends = span.opening(jnp.concatenate(beyond[0]), beyond[1])
-            beyond = halves(wrench), ends
-        return beyond, found
+        return beyond if span is None else at_end(span.opening, beyond), found
 
     tip = halves(none), None if spans is None else none
-    _, (X, negative, asymmetry) = scan(backward, tip, every[0], reverse=True)
+    _, (X, negative, asymmetry) = scan(backward, tip, every_step, reverse=True)
 
     def forward(base: tuple, now: tuple) -> tuple[tuple, Array]:
         (z, force), (X, step) = base, now
@@ -148,12 +147,12 @@ def solved_by_hinges(
                 others = others + product(columns(X, 6, 12), force)
             return behind(z, link, w, columns(X, 0, 6), others)
 
-        z, strain = scan(hinge_behind, z, (X, every[1]))
+        z, strain = scan(hinge_behind, z, (X, every_stage))
         return (z, force), strain
 
     start = columns(none, first, width)
     base = start, None if spans is None else start
-    _, strain = scan(forward, base, (X, every[0]))
+    _, strain = scan(forward, base, (X, every_step))
     strain = jnp.moveaxis(strain, (0, 1), (3, 2))
     negative, asymmetry = (x.reshape(-1, *arms) for x in (negative, asymmetry))
     return strain, negative, asymmetry

@@ -74,8 +74,7 @@ class Chain(NamedTuple):
         unknowns = 0 if by_hinges and spans is None else 6
         hinges = self._hinges(coupled, b, push, unknowns)
         solved = solved_by_hinges if by_hinges else solved_by_joints
-        passed = solved(hinges, self.grid, self.free, spans)
-        strain, negative, asymmetry = passed
+        strain, negative, asymmetry = solved(hinges, self.grid, self.free, spans)
         found = self._free_part(self._turned(transpose(coupled.rotation), strain))
         return found, definiteness(negative, asymmetry, self.grid)
 

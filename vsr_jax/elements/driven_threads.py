@@ -196,7 +196,7 @@ class DrivenThreads(ThreadRule):
         ]
 
     def scales(self, problem: ArmProblem) -> Scales:
-        """The axial stiffness of the arm and its length."""
+        """The stiffness of the arm along each thread, and its length."""
         return Scales(jnp.stack([one.scale for one in self.threads]), problem.length)
 
 

@@ -106,7 +106,7 @@ def body_of(eq: Equilibrium | Summary, stations: VectorLike = 60) -> Body:
         return Body(eq, None, None, None, np.zeros((0, 1, 3)), np.zeros(len(eq.X) - 1, bool))
     if np.ndim(eq.status) == 0 and not bool(eq.converged):
         return body_of(at_rest(eq), stations)._replace(failure=eq.message)
-    if (eq.scene.rod.stiffened or eq.scene.rod.discs) and np.ndim(eq.status) == 0:
+    if (eq.scene.rod.rigid or eq.scene.rod.discs) and np.ndim(eq.status) == 0:
         stations = with_parts(eq.scene, checked_stations(eq, stations, "stations"))
     return body_from_samples(eq, sample(eq, stations))
 

@@ -37,10 +37,10 @@ def next_step(
     (benchmarks/contact_search.py --tubes 64 --steps 12).
     """
     last, dot = trial.step, setting.measures.dot
-    fraction = trial.probing.astype(found.work.dtype)  # a probe sums up its steps
+    fraction = jnp.zeros_like(found.work)
     if dot is None:
-        fraction = jnp.maximum(fraction, _extrapolation(trial, found, setting.tolerance))
-    fraction = once(fraction)
+        fraction = _extrapolation(trial, found, setting.tolerance)
+    fraction = once(jnp.where(trial.probing, 1.0, fraction))  # a probe sums up its steps
     step = jax.tree.map(lambda s, last: s + fraction.astype(s.dtype) * last, trial.new.step, last)
     if dot is not None:
         if setting.schedule.stages:
@@ -67,7 +67,7 @@ def _extrapolation(trial: Trial, found: Contraction, tolerance: Tolerance) -> Ar
     """
     rho = jnp.clip(jnp.minimum(found.work, found.steps), 0.0, MAX_CONTRACTION)
     slow = found.full & (trial.new.merit > 4 * tolerance.rounding) & (rho > _MIN_CONTRACTION)
-    return jnp.where(slow & ~trial.probing, rho**2 / (1 - rho), 0.0)
+    return jnp.where(slow, rho**2 / (1 - rho), 0.0)
 
 
 def finished(trial: Trial, last: Array) -> Any:
