@@ -55,17 +55,21 @@ class Pages:
         if file.suffix != ".md":
             self.write(place(file), file.read_bytes())
             return
-        parts = CODE.split(file.read_text(encoding="utf-8"))
-        parts[::2] = [LINK.sub(lambda link: self.linked(file, link), part) for part in parts[::2]]
-        text = "".join(parts)
+        text = self.with_links(file, file.read_text(encoding="utf-8"))
         text = with_entries(text) if file == DOCS / "api.md" else text
         self.write(place(file), text.encode())
+
+    def with_links(self, page: Path, text: str) -> str:
+        """The text of a page with its links, but for those in code, as they are on the site."""
+        parts = CODE.split(text)
+        parts[::2] = [LINK.sub(lambda link: self.linked(page, link), part) for part in parts[::2]]
+        return "".join(parts)
 
     def linked(self, page: Path, link: re.Match) -> str:
         """A link of a page, as it is on the site; adds what it leads to. A figure `NAME_light.png`
         stands beside `NAME_dark.png`, and the theme shows one of them."""
         before, target, after = link.groups()
-        if target.startswith(("http://", "https://")):
+        if target.startswith(("http://", "https://", "data:")):
             return link.group()
         file = (page.parent / target).resolve()
         if not file.is_file():
@@ -78,14 +82,14 @@ class Pages:
         return f"{before}{new}#only-light)![]({new.replace('_light', '_dark')}#only-dark)"
 
     def add_notebook(self, path: Path, execute: bool) -> None:
-        """Adds a notebook as a page that contains its figures."""
+        """Adds a notebook as a page that contains its figures, data in the place of a link."""
         config = Config()
         config.ExtractOutputPreprocessor.enabled = False
         if execute:
             config.MarkdownExporter.preprocessors = [ExecutePreprocessor(timeout=600)]
         resources = {"metadata": {"path": str(path.parent)}}
         text, _ = MarkdownExporter(config=config).from_filename(str(path), resources)
-        self.write(place(path), text.encode())
+        self.write(place(path), self.with_links(path, text).encode())
 
     def write(self, path: Path, data: bytes) -> None:
         (self.folder / path).parent.mkdir(parents=True, exist_ok=True)
