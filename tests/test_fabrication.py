@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial import KDTree
 
 import vsr_jax as vsr
@@ -57,10 +58,11 @@ def test_drilling_plan_and_lengths():
     assert "thinnest: the wall" in str(made)
 
 
-def two_sections():
+def two_sections(thickness=None):
     """Three cables to the middle through ten discs, and three to the tip through all."""
     places = [*np.arange(1, 11) * 0.01, 0.12, 0.16, 0.19, 0.2]
-    rod = vsr.Rod(0.2, vsr.Circular(5e-4), SOFT, discs=vsr.Discs(places=places, radius=0.009))
+    discs = vsr.Discs(places=places, radius=0.009, thickness=thickness)
+    rod = vsr.Rod(0.2, vsr.Circular(5e-4), SOFT, discs=discs)
     ways = [(8e-3 * np.cos(a), 8e-3 * np.sin(a)) for a in np.arange(6) * np.pi / 3]
     paths = [vsr.Parallel(*way) for way in ways]
     inner = [vsr.Tendon(path, end=0.1, straight=True) for path in paths[::2]]
@@ -75,6 +77,43 @@ def test_the_discs_of_the_tendons_are_drilled():
     np.testing.assert_allclose(list(every), expected, atol=1e-4)
     threads = [row[2] for row in made.holes.rows if row[0] == 11]
     assert threads == [3, 4, 5]  # beyond the others
+
+
+@pytest.mark.slow
+def test_the_body_of_a_robot_has_its_discs_and_their_holes(tmp_path):
+    """The STL file cut in, before and behind each disc, within 0.01 mm of what is declared."""
+    path, thickness, bore = tmp_path / "robot.stl", 2e-3, 1e-3
+    scene = two_sections(thickness)
+    made = vsr.export(scene, stl=path, bore=bore)
+    mesh = trimesh.load(path)
+    assert mesh.is_watertight
+
+    def rings(X):
+        """Centre (y, z) and radius [mm] of each outline at X [mm]."""
+        cut = mesh.section(plane_origin=[X, 0, 0], plane_normal=[1, 0, 0])
+        outlines = [cut.vertices[entity.points[1:], 1:] for entity in cut.entities]
+        middles = [0.5 * (points.max(axis=0) + points.min(axis=0)) for points in outlines]
+        return {
+            tuple(np.round(middle, 1) + 0.0): (
+                middle,
+                np.mean(np.linalg.norm(points - middle, axis=1)),
+            )
+            for middle, points in zip(middles, outlines, strict=True)
+        }
+
+    for X in 1e3 * np.asarray(scene.rod.discs.along(scene.rod.length)):
+        for outside in (X - 2.01, *([X + 0.01] if X < 199 else [])):
+            ((middle, radius),) = rings(outside).values()
+            np.testing.assert_allclose((*middle, radius), (0, 0, 0.5), atol=0.01)
+        for inside in (X - 1.99, X - 0.01):
+            found = rings(inside)
+            np.testing.assert_allclose(found.pop((0.0, 0.0))[1], 9.0, atol=0.01)
+            drilled = [row for row in made.holes.rows if abs(row[1] - X) < 1e-3]
+            places = [tuple(np.round(row[5:7], 1) + 0.0) for row in drilled]
+            assert sorted(found) == sorted(places)
+            for row, place in zip(drilled, places, strict=True):
+                np.testing.assert_allclose(found[place][0], row[5:7], atol=0.01)
+                np.testing.assert_allclose(found[place][1], 1e3 * bore / 2, atol=0.01)
 
 
 def crossing(start=0.002):

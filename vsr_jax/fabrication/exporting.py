@@ -136,7 +136,8 @@ def export(
     **Arguments:**
     - `arm`: a `Scene` for the arm at rest, without inputs and loads; an `Equilibrium` for the arm
       in that shape.
-    - `stl`: the body with its channels as holes, a closed surface of triangles.
+    - `stl`: the body with its channels as holes, a closed surface of triangles. Discs of known
+      radius and thickness are part of it.
     - `step`: the axis and the threads as cubic B-splines, with X [mm] as their parameter.
     - `csv`: the paths of the threads, in space and in the section.
     - `dxf`: the threads at rest, unrolled onto a flat sheath.

@@ -12,11 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ..arm.rod import Rod
 from ..arm.routing import thread_tangent
 from ..arm.scene import Scene
 from ..numerics.compiling import program
 from ..solution.equilibrium import Equilibrium
-from ..typing import DTypeLike
+from ..typing import DTypeLike, Scalar
 
 MILLIMETRES = 1e3
 """Millimetres per metre: files for the workshop are in millimetres."""
@@ -227,15 +228,7 @@ def in_blocks(function: Callable[[Array], Any], X: np.ndarray) -> Any:
 @program("export")
 def _sections(scene: Scene, X: Array, angle: Array) -> tuple[Array, Array, Array, Array]:
     rod, sections = scene.rod, scene.sections(X)
-    outline = jax.vmap(
-        lambda x: jnp.stack(
-            [
-                jnp.broadcast_to(part, angle.shape)
-                for part in rod.section.outline(angle, x, rod.length)
-            ],
-            axis=-1,
-        )
-    )(X)
+    outline = jax.vmap(lambda x: _outline(rod, x, angle))(X)
     inner = jax.vmap(
         lambda x: jnp.broadcast_to(rod.section.inner_radius(x, rod.length), ()).astype(X.dtype)
     )(X)
@@ -246,3 +239,17 @@ def _sections(scene: Scene, X: Array, angle: Array) -> tuple[Array, Array, Array
     path = jnp.stack([jnp.stack((p.y, p.z), axis=-1) for p in sections.paths], axis=1)
     slope = jnp.stack([jnp.stack((t[1], t[2]), axis=-1) / t[0][:, None] for t in tangents], axis=1)
     return outline, inner, path, slope
+
+
+def _outline(rod: Rod, X: Scalar, angle: Float[Array, " angles"]) -> Float[Array, "angles 2"]:
+    """Points (y, z) [m] of the outer wall: that of the section, and the rim of a disc of known
+    radius and thickness where it reaches beyond the section."""
+    wall = [
+        jnp.broadcast_to(part, angle.shape) for part in rod.section.outline(angle, X, rod.length)
+    ]
+    points = jnp.stack(wall, axis=-1)
+    if rod.discs is None or rod.rim is None:
+        return points
+    rim = rod.rim * jnp.stack((jnp.cos(angle), jnp.sin(angle)), axis=-1)
+    beyond = rod.rim > rod.section.outer_radius(X, rod.length)
+    return jnp.where(rod.discs.stiffen(X, rod.length) & beyond, rim, points)
