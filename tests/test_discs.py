@@ -511,10 +511,12 @@ def test_elastic_lengths_with_friction_in_holes_give_back_the_tensions():
 
 
 def test_gradients_by_friction_and_discs():
-    """In both modes, of a number by the friction, a disc, the offset and a tension."""
+    """In both modes, of a number by the friction, a disc, the offset, a tension, the mass and the
+    thickness of the discs."""
 
     def number(p):
-        discs = vsr.Discs(places=jnp.stack([p[1], 0.17 + 0 * p[1], 0.3 + 0 * p[1]]))
+        places = jnp.stack([p[1], 0.17 + 0 * p[1], 0.3 + 0 * p[1]])
+        discs = vsr.Discs(places=places, mass=p[4], thickness=p[5])
         rod = vsr.Rod(LENGTH, vsr.Circular(RADIUS), MATERIAL, discs=discs)
         paths = vsr.Parallel(p[2], 0.001), PATHS[1]
         tendons = [vsr.Tendon(path, straight=True, friction=p[0]) for path in paths]
@@ -522,10 +524,37 @@ def test_gradients_by_friction_and_discs():
         eq = vsr.solve(robot, jnp.stack([p[3], 1.0 + 0 * p[3]]), model=vsr.StrainDependent(6))
         return eq.tip[:3, 3] @ jnp.array([1.0, -2.0, 3.0])
 
-    p, scale = jnp.array([0.2, 0.08, 0.007, 2.0]), jnp.array([1e-2, 1e-3, 1e-4, 1e-2])
+    p = jnp.array([0.2, 0.08, 0.007, 2.0, 2e-3, 4e-3])
+    scale = jnp.array([1e-2, 1e-3, 1e-4, 1e-2, 1e-4, 1e-4])
     solve, reverse = with_derivative(number), jax.jit(jax.grad(number))(p)
     forward = solve(p)[1]
-    differences = central_differences(lambda unit: solve(p + scale * unit)[0], 4)
+    differences = central_differences(lambda unit: solve(p + scale * unit)[0], 6)
+    np.testing.assert_allclose(forward * scale, differences, rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-8)
+    assert np.all(np.abs(forward) > 1e-4)
+
+
+@pytest.mark.slow
+def test_gradients_by_the_spool_and_the_rim():
+    """In both modes, of an arm that motors press with its discs onto a floor: by the radius of the
+    spools, that of the discs and an angle."""
+
+    def number(p):
+        rod = vsr.Rod(LENGTH, vsr.Circular(RADIUS), MATERIAL, discs=vsr.Discs(3, radius=p[1]))
+        tendons = [
+            vsr.Tendon(path, straight=True, control="length", stiffness=2e3, spool=p[0])
+            for path in PATHS
+        ]
+        floor = vsr.Plane((0, 0, 1), (0, 0, -0.035))
+        robot = vsr.Scene(rod, tendons, [vsr.Gravity()], obstacles=[floor])
+        eq = vsr.solve(robot, jnp.stack([p[2], 0.2 + 0 * p[2]]), model=vsr.StrainDependent(6))
+        return jnp.stack([eq.tip[:3, 3] @ jnp.array([1.0, -2.0, 3.0]), eq.contacts.force.sum()])
+
+    p, scale = jnp.array([5e-3, 0.012, 0.4]), jnp.array([1e-4, 1e-4, 1e-2])
+    solve, reverse = with_derivative(number), jax.jit(jax.jacrev(number))(p)
+    found, forward = solve(p)
+    assert found[1] > 1e-3  # touched
+    differences = central_differences(lambda unit: solve(p + scale * unit)[0], 3).T
     np.testing.assert_allclose(forward * scale, differences, rtol=1e-5, atol=1e-9)
     np.testing.assert_allclose(forward, reverse, rtol=1e-8)
     assert np.all(np.abs(forward) > 1e-4)
