@@ -5,7 +5,8 @@ weight and a camera at the tip.
     python benchmarks/bench_discs.py [--json FILE] [--rounds N] [--batch N]
 
 Both sides in one run, in turn, driven by tensions and by lengths: one solve, a solve that starts
-near, a batch, the gradient of one. Then the workspace of 5,000 samples, compiling included.
+near, a batch, the gradient of one. Then the workspace of 5,000 samples and `vsr.sweep` of 100,000,
+compiling included.
 """
 
 import argparse
@@ -32,7 +33,7 @@ CABLE = 5e3
 ANGLES, SECTIONS = np.pi / 3 * np.arange(6), np.array([1, 2] * 3)
 """Places of the holes around the wire, and the last section of each tendon."""
 SIDES = {"along the section": False, "between discs": True}
-WORKSPACE = 5000
+WORKSPACE, SWEEP = 5000, 100_000
 
 
 def robot(straight: bool, control: Any) -> vsr.Scene:
@@ -97,6 +98,13 @@ def workspace(scene: vsr.Scene) -> tuple[float, float]:
     return time.perf_counter() - began, solved
 
 
+def sweep(scene: vsr.Scene) -> tuple[float, float]:
+    """Seconds of a sweep of random tensions, compiling included, and the share solved."""
+    began = time.perf_counter()
+    found = vsr.sweep(scene, inputs("tension", SWEEP), model=MODEL, progress=False)
+    return time.perf_counter() - began, float(np.mean(found.converged))
+
+
 def measure(control: str, batch: int, rounds: int) -> list[dict[str, Any]]:
     """A row for each function: times of both sides and their ratio."""
     both = [calls(robot(straight, control), control, batch) for straight in SIDES.values()]
@@ -152,8 +160,11 @@ def main() -> None:
             )
     seconds, share = workspace(robot(True, "tension"))
     print(f"workspace of {WORKSPACE} samples: {seconds:.1f} s, {share:.1%} solved")
+    found = {"rows": rows, "workspace_s": seconds, "workspace_solved": share}
+    seconds, share = sweep(robot(True, "tension"))
+    print(f"sweep of {SWEEP} samples: {seconds:.0f} s, {share:.3%} solved")
+    found |= {"sweep_s": seconds, "sweep_solved": share}
     if options.json:
-        found = {"rows": rows, "workspace_s": seconds, "workspace_solved": share}
         options.json.write_text(json.dumps({"machine": machine(), **found}, indent=1) + "\n")
 
 
