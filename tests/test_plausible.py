@@ -107,6 +107,18 @@ def test_doubtful_gravity_is_named(acceleration, sentence):
     assert plausible.warnings_of(heavy) == (sentence,)
 
 
+def test_stiffness_that_no_section_has_is_named():
+    def told(EI):
+        rod = vsr.Rod(0.3, vsr.Circular(0.01), vsr.Stiffness(EI, EA=300.0))
+        return plausible.warnings_of(vsr.Scene(rod))
+
+    assert told(7.5e-3) == ()
+    (first, _) = told(7.5)
+    assert first.startswith(
+        "rod.material: EI_y 7.5 N m^2 and EA 300 N; what is stiff would lie 0.158 m from the axis"
+    )
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("aside", [0.0, 0.008])
 def test_a_tension_beyond_what_the_arm_bears_is_named(aside):

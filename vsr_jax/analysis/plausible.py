@@ -144,6 +144,7 @@ def _doubts(scene: Scene) -> Iterator[str]:
             "are length and sizes in one unit?"
         )
     yield from _moduli(measures.material)
+    yield from _measured_stiffness(measures)
     yield from _gravities(scene)
     for i, actuator in enumerate(scene.actuators):
         area, most = actuator.pressure_area, np.max(measures.area)
@@ -177,6 +178,22 @@ def _doubtful_inputs(eq: Equilibrium) -> Iterator[str]:
                 f"inputs[{i}]: {value:.6g} {unit} would strain a section by {strain:.2g}; beyond "
                 f"{LARGEST_STRAIN:g} a linear material is doubtful{slip}"
             )
+
+
+def _measured_stiffness(measures: _Measures) -> Iterator[str]:
+    """Warns of a bending stiffness that material within the outline cannot have beside the axial
+    one: $EI / EA$ is the mean square of its distance from the neutral axis."""
+    material, most = measures.material, np.max(measures.thickness)
+    for name in ("EI_y", "EI_z"):
+        if name in material and "EA" in material:
+            bending, axial = (float(np.mean(material[x])) for x in (name, "EA"))
+            away = np.sqrt(bending / axial)
+            if away > most:
+                yield (
+                    f"rod.material: {name} {bending:.6g} N m^2 and EA {axial:.6g} N; what is stiff "
+                    f"would lie {away:.3g} m from the axis, the outline {most:.3g} m; are both in "
+                    "SI units?"
+                )
 
 
 def _moduli(material: dict[str, np.ndarray]) -> Iterator[str]:

@@ -35,6 +35,7 @@ from .scene import CrossSections, Scene
 from .scene_numbers import Parameter, parameters
 from .section import Annular, Circular, Elliptic, Joined, Rectangular, Section
 from .section_law import LinearLaw, SectionLaw
+from .stiffness import Stiffness
 from .tube import Tube
 
 __all__ = [
@@ -87,6 +88,7 @@ __all__ = [
     "Spline",
     "SplineProfile",
     "Spring",
+    "Stiffness",
     "Support",
     "Taper",
     "Tendon",

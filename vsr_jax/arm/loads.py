@@ -89,20 +89,20 @@ class _ScaledLoad(Load):
 
 
 def need_density(load: Load, rod: Rod) -> None:
-    """Raises `ValueError` if the material of `rod` has no density."""
-    if rod.material.density is None:
+    """Raises `ValueError` if the mass of `rod` is not known."""
+    if not rod.material.weighs:
         raise ValueError(
             f"Scene.loads: got a {type(load).__name__} and a rod whose material has no density, "
-            "need Material(..., density=...)"
+            "need Material(..., density=...) or Stiffness(..., mass=...)"
         )
 
 
 def mass_per_length(rod: Rod, X: ScalarLike, displaced: Scalar | None = None) -> Scalar:
     """Mass per reference length [kg/m], less that of a displaced fluid of a given density."""
-    assert rod.material.density is not None  # see need_density
-    density = rod.material.density(X, rod.length)
-    density = density if displaced is None else density - displaced
-    return density * rod.section.geometry(X, rod.length).area
+    mass = rod.material.mass_per_length(rod.section, X, rod.length)
+    if displaced is None:
+        return mass
+    return mass - displaced * rod.section.geometry(X, rod.length).area
 
 
 class Gravity(Load):

@@ -3,19 +3,19 @@ J_z, E A, \kappa_y G A, \kappa_z G A)$."""
 
 import equinox as eqx
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from ..numerics.component import Vector
 from ..typing import Scalar, ScalarLike
-from .description import Part
+from .elasticity import Elasticity
 from .profile import Limits, Profile, ProfileLike, as_profile
 from .section import Section
-from .section_law import LinearLaw, SectionLaw
 
 LEAST_POISSON, MOST_POISSON = -1.0, 0.5
 """Range of Poisson's ratio of a stable isotropic material; the lower bound is excluded."""
 
 
-class Material(Part):
+class Material(Elasticity):
     """Linear elastic material, uniform or varying along the arm.
 
     **Arguments**, each a profile (a number, a `Profile` or a function of X):
@@ -85,9 +85,16 @@ class Material(Part):
         shear_y, shear_z = (kappa * G * shape.area for kappa in shape.shear_factors)
         return (*angular, E * shape.area, shear_y, shear_z)
 
-    def law(self, section: Section, X: ScalarLike, length: ScalarLike) -> SectionLaw:
-        """The law of a section at X [m], linear; a material of your own may return another."""
-        return LinearLaw()
+    @property
+    def weighs(self) -> bool:
+        return self.density is not None
+
+    def mass_per_length(self, section: Section, X: ScalarLike, length: ScalarLike) -> Array:
+        assert self.density is not None  # see `weighs`
+        return self.density(X, length) * section.geometry(X, length).area
+
+    def moduli(self, X: ScalarLike, length: ScalarLike) -> tuple[Scalar, Scalar]:
+        return self.young(X, length), self.shear_modulus(X, length)
 
     @property
     def breakpoints(self) -> tuple[Scalar, ...]:

@@ -12,7 +12,7 @@ from ..typing import ArrayLike, MatrixLike, Pose, Scalar, ScalarLike, real
 from ..validation import instance, instances, numbers, rigid as rigid_transform
 from .description import Part
 from .discs import Discs
-from .material import Material
+from .elasticity import Elasticity
 from .profile import (
     Limits,
     ProfilesLike,
@@ -40,7 +40,8 @@ class Rod(Part):
 
     **Arguments:**
     - `length`: $L$ [m].
-    - `section`, `material`: define the stiffness, see `Material.stiffness`.
+    - `section`, `material`: a `Material` and the shape of the section define the stiffness, see
+      `Material.stiffness`; a `Stiffness` gives it as it was measured.
     - `rest_strain`: $\\xi^*(X) = (k^*, u^*)$: six profiles (numbers, `Profile` or functions of X),
       or one function of X that returns six numbers. The default (0, 0, 0, 1, 0, 0) is straight. The
       elongation $u_x^*$ must be positive.
@@ -53,7 +54,7 @@ class Rod(Part):
 
     length: Scalar = eqx.field(metadata={"unit": "m"})
     section: Section
-    material: Material
+    material: Elasticity
     rest_strain: ProfileVector = eqx.field(metadata={"unit": _STRAIN_UNITS})
     base: Pose | None = eqx.field(metadata={"unit": "-"})
     discs: Discs | None
@@ -63,7 +64,7 @@ class Rod(Part):
         self,
         length: ScalarLike,
         section: Section,
-        material: Material,
+        material: Elasticity,
         *,
         rest_strain: ProfilesLike | None = STRAIGHT,
         base: MatrixLike | None = None,
@@ -77,7 +78,7 @@ class Rod(Part):
             Section,
             "a section such as Circular, Annular, Rectangular or Elliptic",
         )
-        self.material = instance("Rod.material", material, Material, "a Material")
+        self.material = instance("Rod.material", material, Elasticity, "a Material or a Stiffness")
         self.rest_strain = as_profiles(
             "Rod.rest_strain",
             STRAIGHT if rest_strain is None else rest_strain,

@@ -92,8 +92,9 @@ class Scene(Part):
       their section change `Spring`, `Payload`, `MagneticMoment`, `MagneticDensity` and `Spinning`.
     - `held`: sections that are pinned, clamped or guided in space, `Held`.
     - `free_strains`: names of the strains that can change, all six by default. The others equal
-      their rest value and are not unknowns of the solve. `("bending_y", "bending_z")` is an
-      inextensible rod without twist and shear.
+      their rest value and are not unknowns of the solve; so do those for which the rod has a
+      `Stiffness` without a number. `("bending_y", "bending_z")` is an inextensible rod without
+      twist and shear.
     - `obstacles`: `Plane`, `Sphere`, `Cylinder`, `Box`, `Tube` and `Field`, rigid and fixed.
 
     **Raises:** `ValueError` if
@@ -104,7 +105,7 @@ class Scene(Part):
     - a thread ends or a load acts beyond the arm,
     - a rigid piece is beyond the arm, two of them overlap, or they cover all of the arm,
     - a straight tendon has no discs, or does not start and end in discs,
-    - there is gravity and the material has no density,
+    - there is gravity, and the material has no density or the stiffness no mass,
     - an obstacle has no size, a tube is narrower than the arm, or the arm starts inside an obstacle
       or outside a tube.
 
@@ -141,7 +142,13 @@ class Scene(Part):
             raise ValueError(
                 f"Scene.free_strains: got {free_strains!r}, need some of {', '.join(STRAINS)}"
             )
-        self.free_strains = tuple(name for name in STRAINS if name in names)
+        locked = rod.material.locked
+        self.free_strains = tuple(x for x in STRAINS if x in names and x not in locked)
+        if not self.free_strains:
+            raise ValueError(
+                f"Scene.free_strains: got {free_strains!r} and a rod without stiffness for "
+                f"{', '.join(locked)}; need a strain that can change"
+            )
         self.obstacles = instances(
             "Scene.obstacles", obstacles, Obstacle, "a Plane, Sphere, Tube or other obstacle"
         )

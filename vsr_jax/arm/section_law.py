@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..numerics.component import Matrix, Vector, dot, multiply
+from ..numerics.component import Matrix, Vector, dot, matvec, multiply
 
 
 class SectionLaw(eqx.Module):
@@ -56,3 +56,18 @@ class LinearLaw(SectionLaw):
     def tangent(self, strain: Vector, stiffness: Vector) -> Matrix:
         zero = jnp.zeros_like(strain[0])
         return tuple((*[zero] * i, stiffness[i]) for i in range(6))
+
+
+class CoupledLaw(SectionLaw):
+    r"""$W = \tfrac12 \varepsilon^T \Sigma \varepsilon$ with the rows of a full matrix $\Sigma$."""
+
+    matrix: Matrix
+
+    def energy(self, strain: Vector, stiffness: Vector) -> Array:
+        return 0.5 * dot(self.wrench(strain, stiffness), strain)
+
+    def wrench(self, strain: Vector, stiffness: Vector) -> Vector:
+        return matvec(self.matrix, strain)
+
+    def tangent(self, strain: Vector, stiffness: Vector) -> Matrix:
+        return tuple(row[: i + 1] for i, row in enumerate(self.matrix))

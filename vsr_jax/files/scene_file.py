@@ -3,7 +3,7 @@ constructor by name.
 
 The top level of a file contains the arguments of `Scene` and, optionally, a `title` and `inputs`.
 Units are those of the constructors. The type is optional where only one class is possible (`rod`,
-`material`, `discs`, `rigid`). A profile can be a plain number.
+`discs`, `rigid`) and for a `Material`. A profile can be a plain number.
 
 A new class needs an entry in its group below and a field for each argument of its constructor, of
 the same name. An argument without a field is read but not written, as `diameter` of `Circular`.
@@ -35,6 +35,7 @@ from ..arm.rod import Rod
 from ..arm.routing import Helix, Linear, Parallel, Polynomial, Spline
 from ..arm.scene import Scene
 from ..arm.section import Annular, Circular, Elliptic, Joined, Rectangular
+from ..arm.stiffness import Stiffness
 from ..arm.tube import Tube
 from ..typing import PathLike, VectorLike
 from ..validation import concrete
@@ -56,7 +57,7 @@ _GROUPS = {
     "rod": _group(Rod),
     "discs": _group(Discs),
     "rigid": _group(RigidPiece),
-    "material": _group(Material),
+    "material": _group(Material, Stiffness),
     "section": _SECTIONS,
     "sections": _SECTIONS,
     "routing": _group(Parallel, Linear, Helix, Polynomial, Spline),
@@ -76,6 +77,9 @@ _GROUPS = {
     "obstacles": _group(Plane, Sphere, Cylinder, Box, Tube),
 }
 """Classes that are possible under a key; profiles under every other key."""
+
+_USUAL = (Material,)
+"""Classes of a table without a type where others are possible too."""
 
 _FILE_KEYS = ("title", "inputs")
 _SHORT_LIST = re.compile(r"\[\n[^][{}]*\]")
@@ -191,8 +195,9 @@ def kind_of(table: Table, path: str, group: Group) -> type:
     """The class named by the `type` of a table, one of a group."""
     known = ", ".join(sorted(group))
     if "type" not in table:
-        if len(group) == 1:
-            return next(iter(group.values()))
+        usual = [kind for kind in group.values() if len(group) == 1 or kind in _USUAL]
+        if usual:
+            return usual[0]
         raise ValueError(f"{path}: missing key 'type', known types are {known}")
     name = table["type"]
     if not isinstance(name, str) or name not in group:
@@ -287,7 +292,7 @@ def _write(value: Any, path: str, group: Group) -> Any:
             f"{', '.join(sorted(group))}"
         )
     table = _arguments(value, path)
-    return table if len(group) == 1 else {"type": name} | table
+    return table if len(group) == 1 or type(value) in _USUAL else {"type": name} | table
 
 
 def _numbers(value: Any, path: str) -> Any:

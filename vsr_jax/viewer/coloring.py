@@ -72,9 +72,10 @@ COLORINGS = {
 
 def colorings_of(scene: Scene) -> tuple[str, ...]:
     """Names of the choices for a scene: pressure only with chambers, tension only with other
-    threads."""
+    threads, stress only where moduli are known."""
     inflated = [actuator.pressure_area is not None for actuator in scene.actuators]
     there = {"tension": not all(inflated), "pressure": any(inflated)}
+    there["stress"] = scene.rod.material.moduli(0.0, scene.rod.length) is not None
     return tuple(name for name in COLORINGS if there.get(name, True))
 
 

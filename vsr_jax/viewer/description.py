@@ -71,7 +71,8 @@ def _described(eq: Equilibrium) -> tuple[Summary, Array, Array, list[Acting]]:
 def wall_state(
     rod: Rod, samples: Summary
 ) -> tuple[Float[Array, "stations angles"], Float[Array, "stations angles"]]:
-    """Longitudinal strain [-] and von Mises stress [Pa] at the points of the wall of `samples`."""
+    """Longitudinal strain [-] and von Mises stress [Pa] at the points of the wall of `samples`; NaN
+    for stress where no moduli are known."""
     X, length = samples.X, rod.length
     rest = jnp.stack(jax.vmap(rod.rest)(X), axis=-1)
     k, u = jnp.split((samples.strain - rest)[:, None, :], 2, axis=-1)
@@ -79,7 +80,9 @@ def wall_state(
     y, z = jnp.moveaxis(jnp.einsum("xai,xij->xaj", from_axis, samples.pose[:, :3, 1:3]), -1, 0)
     strain = u[..., 0] + k[..., 1] * z - k[..., 2] * y
     shear_y, shear_z = u[..., 1] - k[..., 0] * z, u[..., 2] + k[..., 0] * y
-    young = jax.vmap(lambda x: rod.material.young(x, length))(X)[:, None]
-    shear = jax.vmap(lambda x: rod.material.shear_modulus(x, length))(X)[:, None]
+    moduli = jax.vmap(lambda x: rod.material.moduli(x, length))(X)
+    if moduli is None:
+        return strain, jnp.full_like(strain, jnp.nan)
+    young, shear = (modulus[:, None] for modulus in moduli)
     stress = jnp.sqrt((young * strain) ** 2 + 3 * shear**2 * (shear_y**2 + shear_z**2))
     return strain, stress

@@ -1,0 +1,52 @@
+"""How the sections of an arm resist strain, and what they weigh: the interface of materials."""
+
+from abc import abstractmethod
+
+from jaxtyping import Array
+
+from ..numerics.component import Vector
+from ..typing import Scalar, ScalarLike
+from .description import Part
+from .profile import Limits
+from .section import Section
+from .section_law import LinearLaw, SectionLaw
+
+
+class Elasticity(Part):
+    """What a `Rod` is made of: a `Material`, which with the shape of the section gives its
+    stiffness, or a `Stiffness` as it was measured. All methods take X and the arm's length [m]."""
+
+    @abstractmethod
+    def stiffness(self, section: Section, X: ScalarLike, length: ScalarLike) -> Vector:
+        r"""Diagonal of $\Sigma(X)$, six scalars [N m^2] and [N]."""
+
+    def law(self, section: Section, X: ScalarLike, length: ScalarLike) -> SectionLaw:
+        """The law of a section, linear and without couplings unless a subclass says otherwise."""
+        return LinearLaw()
+
+    @property
+    @abstractmethod
+    def weighs(self) -> bool:
+        """Whether the mass is known."""
+
+    @abstractmethod
+    def mass_per_length(self, section: Section, X: ScalarLike, length: ScalarLike) -> Array:
+        """Mass per reference length [kg/m], where it is known."""
+
+    def moduli(self, X: ScalarLike, length: ScalarLike) -> tuple[Scalar, Scalar] | None:
+        """Young's and the shear modulus [Pa], None where stress in a section is not known."""
+        return None
+
+    @property
+    def locked(self) -> tuple[str, ...]:
+        """Names of the strains that do not change."""
+        return ()
+
+    @abstractmethod
+    def limits(self, X: ScalarLike, length: ScalarLike) -> Limits:
+        """Its numbers and their limits."""
+
+    @property
+    @abstractmethod
+    def breakpoints(self) -> tuple[Scalar, ...]:
+        """Abscissas [m] where a property or one of its derivatives jumps."""
