@@ -140,6 +140,27 @@ def test_rotation_vectors_are_those_of_the_exponential(angle):
 
 
 @pytest.mark.slow
+@jax.jit
+def there_and_back(twist):
+    """A twist by way of its pose, and the derivative in both modes."""
+
+    def through(twist):
+        return se3.log(se3.exp(twist))
+
+    return through(twist), jax.jacfwd(through)(twist), jax.jacrev(through)(twist)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-6, 0.3, 1.99, 2.01, 3.1])
+def test_the_logarithm_inverts_the_exponential(angle):
+    axis = np.array([0.6, -0.48, 0.64])
+    twist = jnp.append(angle * axis, jnp.array([0.3, -1.2, 0.7]))
+
+    found, *derivatives = there_and_back(twist)
+    np.testing.assert_allclose(found, twist, atol=2e-13)
+    for derivative in derivatives:
+        np.testing.assert_allclose(derivative, np.eye(6), atol=1e-11)
+
+
 def test_rotation_vectors_have_derivatives_up_to_half_a_turn():
     for angle in (0.0, 0.5, 2.0, 2.2, 3.1, 3.14):
         at = jnp.array([0.48, 0.6, 0.64]) * angle

@@ -21,6 +21,7 @@ from .profile import (
     breakpoints_of,
     values_at,
 )
+from .rest_shape import rest_shape
 from .rigid_piece import RigidPiece
 from .section import Section
 from .section_law import SectionLaw
@@ -88,6 +89,50 @@ class Rod(Part):
         self.base = None if base is None else rigid_transform("Rod.base", base)
         self.discs = None if discs is None else instance("Rod.discs", discs, Discs, "Discs or None")
         self.rigid = instances("Rod.rigid", rigid, RigidPiece, "a RigidPiece")
+
+    @classmethod
+    def through(
+        cls,
+        points: MatrixLike,
+        section: Section,
+        material: Elasticity,
+        *,
+        frames: ArrayLike | None = None,
+        roll: ScalarLike = 0.0,
+        discs: Discs | None = None,
+        rigid: Sequence[RigidPiece] | RigidPiece = (),
+    ) -> "Rod":
+        r"""A rod whose axis at rest is a smooth curve through points: a precurved tube, a coil, a
+        shape that was measured or drawn.
+
+            t = jnp.linspace(0, 1, 50)
+            arc = jnp.stack([jnp.sin(t), 0 * t, 1 - jnp.cos(t)], axis=1) * 0.2
+            rod = vsr.Rod.through(arc, vsr.Circular(0.005), material)
+
+        X is the arc length of the curve. The curve has the error of a cubic spline, of fourth order
+        in the distance of the points, and is differentiable by them. It is not smoothed: a noisy
+        measurement needs few points or to be smoothed before.
+
+        **Arguments:**
+        - `points`: in the world [m], from the base to the tip, shape (points, 3).
+        - `section`, `material`, `discs`, `rigid`: as of `Rod`.
+        - `frames`: rotations of the sections at the points, with their x axes along the curve,
+          shape (points, 3, 3); by default the sections do not turn about the curve.
+        - `roll`: without frames, the angle [rad] of the base about the curve, as of `pose`.
+
+        **Raises:** `ValueError` for fewer than two points, the same point twice in a row, and for
+        frames that are not rotations or whose x axes point against the curve.
+        """
+        shape = rest_shape(points, frames, roll)
+        return cls(
+            shape.length,
+            section,
+            material,
+            rest_strain=shape.strain,
+            base=shape.base,
+            discs=discs,
+            rigid=rigid,
+        )
 
     @property
     def frame(self) -> Pose | None:

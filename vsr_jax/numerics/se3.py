@@ -230,6 +230,26 @@ def rotation_vector(rotation: MatrixLike) -> Float[Array, "3"]:
     return jnp.where(large, turned, factor * axis)
 
 
+def log(g: MatrixLike) -> Twist:
+    r"""Logarithm of a pose: the twist $\Omega$ with $\exp \hat\Omega = g$ and an angle up to half a
+    turn.
+
+    $\Omega = (\theta, r - \frac12 \theta \times r + \frac{c_3 - 2 c_4}{2 c_2} \theta \times (\theta
+    \times r))$ with the rotation vector $\theta$ and the Stumpff functions $c_n(|\theta|^2)$.
+    """
+    g = real(g)
+    theta, r = rotation_vector(g[:3, :3]), g[:3, 3]
+    x = jnp.dot(theta, theta)
+    near = x < _SWITCH
+    _, c2, c3 = exp_coefficients(x)
+    c4 = jnp.where(
+        near, _stumpff(jnp.where(near, x, 0.0), 3)[1], (0.5 - c2) / jnp.where(near, 1.0, x)
+    )
+    across = jnp.cross(theta, r)
+    factor = 0.5 * (c3 - 2 * c4) / c2
+    return jnp.concatenate([theta, r - 0.5 * across + factor * jnp.cross(theta, across)])
+
+
 def _blocks(a: Array, b: Array, c_: Array, d: Array) -> Float[Array, "6 6"]:
     return jnp.concatenate([jnp.concatenate([a, b], axis=1), jnp.concatenate([c_, d], axis=1)])
 
