@@ -90,7 +90,7 @@ class Actuator(Part):
 
     @property
     def pressure_area(self) -> Scalar | None:
-        """Area [m^2] on which a pressure acts; None if the input is no pressure."""
+        """Area [m^2] on which a pressure acts; None for what is no chamber."""
         return None
 
     @property
@@ -106,6 +106,11 @@ class Actuator(Part):
         r"""A force [N] that is zero where the force of the thread fits its length and the input,
         and that falls as $\tau$ rises; $F(a) - \tau$ by default, with F the `force`."""
         return self.force(value) - thread.force
+
+    def potential(self, thread: ThreadState, value: ScalarLike) -> Scalar:
+        r"""Potential [J] of a thread with a `law`, whose derivative by the length is $-\tau$;
+        $-\tau l$ by default, as of a given force."""
+        return -thread.force * thread.length
 
     @property
     def breakpoints(self) -> tuple[Scalar, ...]:
@@ -308,20 +313,44 @@ class Tendon(Actuator):
         return jnp.where(-thread.force < slack, -thread.force, slack)
 
 
+ATMOSPHERE = 101_325.0
+"""Standard atmosphere [Pa]."""
+
+
 class Chamber(Actuator):
-    """A slender fluidic chamber: the input is the gauge pressure $p$ [Pa], $\\tau = p a$.
-    A negative pressure is a vacuum.
+    r"""A slender fluidic chamber of constant cross-section, driven by its pressure, by the volume
+    that a syringe pushes in, or by an amount of gas. The gauge pressure $p$ acts on its ends, $\tau
+    = p a$; a negative one is a vacuum.
+
+    With `control="pressure"` the input is $p$ [Pa]. Otherwise the pressure is an unknown, $p = \tau
+    / a$ with $\tau$ from `Equilibrium.forces`. With the lengths $l^*$ of the chamber at rest and
+    $l$ in the deformed arm:
+
+    - `control="volume"`: the input is the volume $V$ [m^3] of liquid pushed in beyond that at rest,
+      $a (l - l^*) + C p = V$.
+    - `control="gas"`: the input is the volume $V_n$ [m^3] that the gas in the chamber and its
+      supply has at the atmospheric pressure $p_0$ and the same temperature, $(p_0 + p)(V_d + a l) =
+      p_0 V_n$. At rest without gauge pressure it is $V_d + a l^*$.
 
     **Arguments:**
     - `routing`: the chamber's centre line.
-    - `area`: cross-sectional area $a$ of the chamber [m^2], positive.
+    - `area`: cross-sectional area $a$ of the chamber [m^2], positive: that of its fluid, on which
+      the pressure pushes lengthways.
     - `start`, `end`: as for every actuator.
+    - `control`: `"pressure"`, `"volume"` or `"gas"`.
+    - `compliance`: $C$ [m^3/Pa] of the syringe and its tube, 0 by default; for volumes only.
+    - `dead_volume`: $V_d$ [m^3] of the supply, 0 by default, `atmosphere`: $p_0$ [Pa], 101,325 by
+      default; for gas only.
     """
 
     routing: Routing
     area: Scalar = eqx.field(metadata={"unit": "m^2"})
     start: Scalar | None = eqx.field(metadata={"unit": "m"})
     end: Scalar | None = eqx.field(metadata={"unit": "m"})
+    compliance: Scalar | None = eqx.field(metadata={"unit": "m^3/Pa"})
+    dead_volume: Scalar | None = eqx.field(metadata={"unit": "m^3"})
+    atmosphere: Scalar | None = eqx.field(metadata={"unit": "Pa"})
+    control: Literal["pressure", "volume", "gas"] = eqx.field(static=True)
     effect = "chambers"
 
     def __init__(
@@ -331,17 +360,93 @@ class Chamber(Actuator):
         *,
         start: ScalarLike | None = None,
         end: ScalarLike | None = None,
+        control: Literal["pressure", "volume", "gas"] = "pressure",
+        compliance: ScalarLike | None = None,
+        dead_volume: ScalarLike | None = None,
+        atmosphere: ScalarLike | None = None,
     ):
         self.routing, self.start, self.end = _checked("Chamber", routing, start, end)
         self.area = numbers("Chamber.area", area, positive=True)
+        self.control = choice("Chamber.control", control, ("pressure", "volume", "gas"))
+        for name, value, needed in (
+            ("compliance", compliance, "volume"),
+            ("dead_volume", dead_volume, "gas"),
+            ("atmosphere", atmosphere, "gas"),
+        ):
+            if value is not None and control != needed:
+                raise ValueError(
+                    f"Chamber.{name}: got {value!r} with control={control!r}, need "
+                    f"control={needed!r}"
+                )
+        self.compliance = (
+            None if compliance is None else numbers("Chamber.compliance", compliance, least=0.0)
+        )
+        self.dead_volume = (
+            None if dead_volume is None else numbers("Chamber.dead_volume", dead_volume, least=0.0)
+        )
+        self.atmosphere = (
+            None if atmosphere is None else numbers("Chamber.atmosphere", atmosphere, positive=True)
+        )
 
     @property
     def unit(self) -> str:
-        return "Pa"
+        return "Pa" if self.control == "pressure" else "m^3"
+
+    @property
+    def lowest(self) -> float:
+        return 0.0 if self.control == "gas" else float("-inf")
+
+    @property
+    def law_driven(self) -> bool:
+        return self.control != "pressure"
 
     @property
     def pressure_area(self) -> Scalar:
         return self.area
 
+    @property
+    def effects(self) -> tuple[str, ...]:
+        return (self.effect, *([f"{self.control} control"] if self.law_driven else []))
+
     def force(self, value: ScalarLike) -> Scalar:
-        return real(value) * self.area
+        """$\\tau = p a$; zero, the first iterate, where the pressure is an unknown."""
+        value = real(value)
+        return jnp.zeros_like(value) if self.law_driven else value * self.area
+
+    def free_length(self, rest: ScalarLike, value: ScalarLike) -> Scalar:
+        change = real(value) / self.area if self.control == "volume" else 0.0
+        return real(rest) + change
+
+    def law(self, thread: ThreadState, value: ScalarLike) -> Scalar:
+        """The volume that lacks room, or the force of the gas beyond that of the thread."""
+        if self.control == "volume":
+            missing = self.free_length(thread.rest, value) - thread.length
+            if self.compliance is not None:
+                missing -= self.compliance * thread.force / self.area**2
+            return thread.scale * missing
+        if self.control == "gas":
+            room = self.amount(thread.length)
+            return self.area * self._outside * (real(value) / room - 1) - thread.force
+        return super().law(thread, value)
+
+    def potential(self, thread: ThreadState, value: ScalarLike) -> Scalar:
+        r"""$\frac12 C p^2$ of a syringe, and $p_0 (v - V_n \ln v)$ of gas in the atmosphere, with
+        its volume $v = V_d + a l$."""
+        if self.control == "volume":
+            pressure = thread.force / self.area
+            squared = pressure * pressure
+            return 0 * squared if self.compliance is None else 0.5 * self.compliance * squared
+        if self.control == "gas":
+            room = self.amount(thread.length)
+            return self._outside * (room - real(value) * jnp.log(room))
+        return super().potential(thread, value)
+
+    def amount(self, length: ScalarLike) -> Scalar:
+        """The input [m^3] at which gas in a chamber of a given length [m] has no gauge pressure:
+        the volume of the chamber and its supply."""
+        room = self.area * real(length)
+        return room if self.dead_volume is None else room + self.dead_volume
+
+    @property
+    def _outside(self) -> Scalar | float:
+        return ATMOSPHERE if self.atmosphere is None else self.atmosphere

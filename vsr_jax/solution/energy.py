@@ -18,11 +18,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ..arm.actuator import ThreadState
 from ..arm.pose_loads import PoseLoad
 from ..arm.rod import Rod
 from ..arm.scene import Scene
 from ..elements.chords import chords_of
-from ..elements.driven_threads import driven_of
+from ..elements.driven_threads import driven_of, thread_length
 from ..mechanics.balance import thread_direction
 from ..models.base import Nodes
 from ..numerics import component as c
@@ -34,8 +35,9 @@ class Energy(NamedTuple):
     """Parts of the potential energy [J].
 
     **Fields:** `elastic`: of the rod's strain; `cables`: of the stretch of tendons that are driven
-    by their length; `actuation`: of given forces and pressures; `loads`: of dead forces, zero for
-    an axis at the world's origin, and of loads that depend on the pose.
+    by their length; `actuation`: of given forces and pressures, and the `potential` of other laws,
+    as of gas; `loads`: of dead forces, zero for an axis at the world's origin, and of loads that
+    depend on the pose.
     """
 
     elastic: Scalar
@@ -64,6 +66,11 @@ def energy_of(
     for i, path in enumerate(nodes.sections.paths):
         if i in driven:
             cables = cables + _stretch(scene, inputs, forces, nodes, i)
+        elif i in scene.law_driven:
+            thread = driven_of(scene, inputs[i], i, nodes.sections, nodes.grid)
+            length = thread_length(scene, nodes.xi, nodes.sections, i, nodes.grid)
+            state = ThreadState(forces[i], length, thread.rest, thread.scale)
+            actuation += scene.actuators[i].potential(state, inputs[i])
         elif i in scene.straight:
             chords = chords_of(scene, nodes.xi, nodes.grid)
             actuation -= forces[i] * chords.path_length(i, nodes.shares[i])

@@ -163,8 +163,11 @@ def arm_of(scene: Scene, inputs: Array, forces: Vector, nodes: Nodes) -> ScaledT
             length = thread_length(scene, xi, sections, place, grid)
             share = nodes.shares[place]
             law = thread.law(-forces[place], length, share, grid)
-            stiffness = -law.by_length / thread.gives(law, share, grid)
+            gives = thread.gives(law, share, grid)
+            rigid = gives == 0  # as a chamber of given volume
+            stiffness = jnp.where(rigid, 0.0, -law.by_length / jnp.where(rigid, 1.0, gives))
             springs.append(_springs(row, stiffness[None], scale, scene.free))
+            ties.append(_ties(row, rigid[None], scale, scene.free))
     return _tied(problem, ArmUnknown(xi, ()), units, ties, springs, scene.free)
 
 

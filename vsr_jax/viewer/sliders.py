@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, TypeAlias
 import jax.numpy as jnp
 import numpy as np
 
-from ..arm.actuator import Actuator, Tendon
+from ..arm.actuator import Actuator, Chamber
 from ..arm.scene import Scene
 from ..arm.scene_numbers import Parameter, matching, parameters
 from ..optimization.problem import INPUTS
@@ -174,8 +174,7 @@ def _default_bounds(scene: Scene, inputs: np.ndarray) -> tuple[np.ndarray, np.nd
             low[i], high[i] = 2 * min(alike.min(), 0.0), 2 * max(alike.max(), 0.0)
         else:
             size = _visible_input(scene, actuator)
-            both = not isinstance(actuator, Tendon) or actuator.length_driven
-            low[i], high[i] = -size * both, size
+            low[i], high[i] = -size * (actuator.lowest < 0), size
     return low, high
 
 
@@ -192,13 +191,16 @@ def _visible_input(scene: Scene, actuator: Actuator) -> float:
     force = _STRETCH * stretching
     if lever > 0:
         force = min(_BEND * bending / (length * lever), force)
-    if actuator.length_driven:  # by bending and by stretching
-        bent = force * length * lever / bending
-        change = bent * lever + force * length / stretching
-        per_input = actuator.free_length(0.0, 1.0) - actuator.free_length(0.0, 0.0)
-        return float(f"{change / abs(float(per_input)):.2g}")
     area = actuator.pressure_area
-    return float(f"{force if area is None else force / float(area):.2g}")
+    per_input = float(actuator.free_length(0.0, 1.0) - actuator.free_length(0.0, 0.0))
+    if per_input:  # by bending and by stretching
+        bent = force * length * lever / bending
+        found = (bent * lever + force * length / stretching) / abs(per_input)
+    elif isinstance(actuator, Chamber) and actuator.control == "gas":
+        found = 2 * float(actuator.amount(length))
+    else:
+        found = force if area is None else force / float(area)
+    return float(f"{found:.2g}")
 
 
 def _default_range(

@@ -121,9 +121,10 @@ def with_parts(scene: Scene, X: Float[Array, " stations"]) -> Float[Array, " mor
 
 def body_from_samples(eq: Equilibrium, samples: Summary) -> Body:
     """The arm of a converged equilibrium from its `samples`, as `sample` returns them."""
-    inflated = np.array([x.pressure_area is not None for x in eq.scene.actuators], bool)
-    tension = np.where(inflated, np.nan, -np.asarray(samples.values["forces"]))
-    pressure = np.where(inflated, np.asarray(eq.inputs), np.nan)
+    areas = [x.pressure_area for x in eq.scene.actuators]
+    area = np.array([np.nan if x is None else float(x) for x in areas])
+    forces = np.asarray(samples.values["forces"])
+    tension, pressure = np.where(np.isnan(area), -forces, np.nan), forces / area
     between = jnp.asarray(samples.X[1:] + samples.X[:-1]) / 2
     flexible = eq.scene.rod.flexible(between)
     rigid = np.zeros(between.shape, bool) if flexible is None else np.asarray(flexible) == 0
