@@ -121,10 +121,12 @@ def with_parts(scene: Scene, X: Float[Array, " stations"]) -> Float[Array, " mor
 
 def body_from_samples(eq: Equilibrium, samples: Summary) -> Body:
     """The arm of a converged equilibrium from its `samples`, as `sample` returns them."""
-    areas = [x.pressure_area for x in eq.scene.actuators]
-    area = np.array([np.nan if x is None else float(x) for x in areas])
-    forces = np.asarray(samples.values["forces"])
-    tension, pressure = np.where(np.isnan(area), -forces, np.nan), forces / area
+    actuators = eq.scene.actuators
+    areas = [np.nan if x.pressure_area is None else float(x.pressure_area) for x in actuators]
+    area, unknown = np.array(areas), np.array([x.law_driven for x in actuators], bool)
+    forces, inflated = np.asarray(samples.values["forces"]), ~np.isnan(area)
+    tension = np.where(inflated, np.nan, -forces)
+    pressure = np.where(inflated, np.where(unknown, forces / area, np.asarray(eq.inputs)), np.nan)
     between = jnp.asarray(samples.X[1:] + samples.X[:-1]) / 2
     flexible = eq.scene.rod.flexible(between)
     rigid = np.zeros(between.shape, bool) if flexible is None else np.asarray(flexible) == 0
