@@ -143,7 +143,8 @@ def finger() -> Any:
     up = np.arange(0.3, 7.3, 0.3)
     tensions = np.concatenate([up, up[-2:7:-1]])
     shown = {1.2: ink(0.4), 3.0: colors[2], 4.8: colors[0], 7.2: colors[1]}
-    smooth, held = (_pressed(file.scene, mu, tensions) for mu in (0.0, 0.7))
+    held = _pressed(file.scene, 0.7, tensions)
+    smooth = _pressed(file.scene, 0.0, up[up < 5.5])  # it slips off at 5.4 N
     left.add_patch(Circle((36.0, -60.0), 20.0, color=mixed(ink(0.0), colors[5], 0.35)))
     for tension, color in shown.items():
         i = int(np.argmin(np.abs(up - tension)))
