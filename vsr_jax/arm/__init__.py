@@ -8,7 +8,7 @@ from .actuator import Actuator, Chamber, Tendon, Thread, ThreadState
 from .discs import Discs
 from .held import Held, Support
 from .loads import DistributedWrench, Frame, Gravity, Load, PointWrench, TipWrench
-from .material import Material
+from .material import Material, NeoHookean
 from .obstacles import Box, Cylinder, Field, Obstacle, Plane, Sphere
 from .placement import pose
 from .pose_loads import (
@@ -65,6 +65,7 @@ __all__ = [
     "MagneticDensity",
     "MagneticMoment",
     "Material",
+    "NeoHookean",
     "Obstacle",
     "Parallel",
     "Parameter",

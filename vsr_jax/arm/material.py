@@ -10,6 +10,7 @@ from ..typing import Scalar, ScalarLike
 from .elasticity import Elasticity
 from .profile import Limits, Profile, ProfileLike, as_profile
 from .section import Section
+from .section_law import NeoHookeanLaw, SectionLaw
 
 LEAST_POISSON, MOST_POISSON = -1.0, 0.5
 """Range of Poisson's ratio of a stable isotropic material; the lower bound is excluded."""
@@ -103,3 +104,23 @@ class Material(Elasticity):
             p for p in (self.young, self.shear, self.poisson, self.density) if p is not None
         ]
         return tuple(x for profile in profiles for x in profile.breakpoints)
+
+
+class NeoHookean(Material):
+    r"""Incompressible rubber, $W = \frac{E}{6} (I_1 - 3)$ per volume: the sections become smaller
+    as the arm stretches, $A / \lambda$. A bar carries $N = \frac{EA}{3} (\lambda - \lambda^{-2})$,
+    and resists bending with $\frac{EJ}{3} (1 + 2 \lambda^{-3})$ and twist with $GJ / \lambda$,
+    where $G = E / 3$. Valid where the strain by bending and twist is moderate.
+
+    Small strains are those of a `Material` with `poisson=0.5`. The paths of threads and the areas
+    of chambers do not shrink with the section.
+
+    **Arguments**, profiles: `young` $E$ [Pa] at small strains; `density` [kg/m^3], required only by
+    `Gravity`.
+    """
+
+    def __init__(self, young: ProfileLike, density: ProfileLike | None = None):
+        super().__init__(young, poisson=MOST_POISSON, density=density)
+
+    def law(self, section: Section, X: ScalarLike, length: ScalarLike) -> SectionLaw:
+        return NeoHookeanLaw()

@@ -26,7 +26,7 @@ from ..arm.discs import Discs
 from ..arm.fields import arguments
 from ..arm.held import Held
 from ..arm.loads import DistributedWrench, Gravity, PointWrench, TipWrench
-from ..arm.material import Material
+from ..arm.material import Material, NeoHookean
 from ..arm.obstacles import Box, Cylinder, Plane, Sphere
 from ..arm.pose_loads import MagneticDensity, MagneticMoment, Payload, Spinning, Spring
 from ..arm.profile import Constant, Piecewise, PolynomialProfile, SplineProfile, Taper
@@ -57,7 +57,7 @@ _GROUPS = {
     "rod": _group(Rod),
     "discs": _group(Discs),
     "rigid": _group(RigidPiece),
-    "material": _group(Material, Stiffness),
+    "material": _group(Material, NeoHookean, Stiffness),
     "section": _SECTIONS,
     "sections": _SECTIONS,
     "routing": _group(Parallel, Linear, Helix, Polynomial, Spline),
