@@ -110,8 +110,8 @@ def test_models_agree():
     tendon = vsr.Tendon(vsr.Helix(0.006, pitch=0.4))
     scene = vsr.Scene(ROD, tendon, [vsr.Gravity(), vsr.TipWrench(force=(0.5, 0.2, 0.3))])
     models = (
-        vsr.StrainDependent(24),
-        vsr.Prescribed(vsr.Basis.uniform(vsr.Legendre(13))),
+        vsr.StrainDependent(40),
+        vsr.Prescribed(vsr.Basis.uniform(vsr.Legendre(13)), steps=40),
         vsr.Continuum(rtol=1e-10, atol=1e-12),
     )
     tips = [vsr.solve(scene, [30.0], model=model, throw=True).tip for model in models]
