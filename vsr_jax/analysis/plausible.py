@@ -17,6 +17,7 @@ from jaxtyping import Array, PyTree
 from ..arm.loads import Gravity
 from ..arm.rod import Rod
 from ..arm.scene import Scene
+from ..arm.section_law import CoupledLaw, LinearLaw
 from ..mechanics.balance import unit_wrench
 from ..numerics.compiling import program
 from ..numerics.component import times
@@ -111,7 +112,10 @@ def warnings_of(scene: Scene) -> tuple[str, ...]:
 def strain_warnings(eq: Equilibrium) -> tuple[str, ...]:
     """Sentences about inputs that strain an arm far too much, or one if the strains of a solved arm
     are too large for a linear material; none for traced solves."""
+    rod = eq.scene.rod
     if _unknown(eq) or jnp.ndim(eq.status):
+        return ()
+    if not isinstance(rod.law(0.5 * rod.length), LinearLaw | CoupledLaw):
         return ()
     if not bool(eq.converged):
         return tuple(_doubtful_inputs(eq))
@@ -169,6 +173,8 @@ def _gravities(scene: Scene) -> Iterator[str]:
 def _doubtful_inputs(eq: Equilibrium) -> Iterator[str]:
     """Warns of inputs that alone would strain a section far too much."""
     scene = eq.scene
+    if not scene.actuators:
+        return
     largest = np.asarray(_strain_by_inputs(scene, eq.inputs))
     for i, (actuator, strain) in enumerate(zip(scene.actuators, largest, strict=True)):
         if strain > _FAR:

@@ -6,6 +6,7 @@ Data and their geometry only. Must not know how an equilibrium is found or how a
 
 from .actuator import Actuator, Chamber, Tendon, Thread, ThreadState
 from .discs import Discs
+from .elasticity import Elasticity
 from .held import Held, Support
 from .loads import DistributedWrench, Frame, Gravity, Load, PointWrench, TipWrench
 from .material import Material, NeoHookean
@@ -50,6 +51,7 @@ __all__ = [
     "Cylinder",
     "Discs",
     "DistributedWrench",
+    "Elasticity",
     "Elliptic",
     "Field",
     "Frame",

@@ -94,7 +94,7 @@ class Material(Elasticity):
         assert self.density is not None  # see `weighs`
         return self.density(X, length) * section.geometry(X, length).area
 
-    def moduli(self, X: ScalarLike, length: ScalarLike) -> tuple[Scalar, Scalar]:
+    def moduli(self, X: ScalarLike, length: ScalarLike) -> tuple[Scalar, Scalar] | None:
         return self.young(X, length), self.shear_modulus(X, length)
 
     @property
@@ -124,3 +124,6 @@ class NeoHookean(Material):
 
     def law(self, section: Section, X: ScalarLike, length: ScalarLike) -> SectionLaw:
         return NeoHookeanLaw()
+
+    def moduli(self, X: ScalarLike, length: ScalarLike) -> None:
+        """None: stress is not $E$ times the strain."""
