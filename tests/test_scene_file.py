@@ -49,7 +49,7 @@ def same(a, b) -> bool:
 
 
 def full_scene() -> vsr.Scene:
-    """A scene that holds every class a file can hold."""
+    """A scene that holds every class a file can hold but for the materials in OTHER_MATERIALS."""
     wave = vsr.SplineProfile([0.0, 0.1, 0.3, 0.4, 0.5], [0.0, 1 / 3, -2e-17, 1e5 / 7, 0.2])
     radius = vsr.Piecewise(
         [0.05, 0.1], [vsr.Taper(0.021, 0.02), 0.02, vsr.PolynomialProfile([0.02, -1e-3])]
@@ -103,6 +103,13 @@ def full_scene() -> vsr.Scene:
     return vsr.Scene(rod, actuators, loads, free_strains=free, obstacles=obstacles)
 
 
+OTHER_MATERIALS = (
+    vsr.NeoHookean(vsr.Taper(1e6, 2e6 / 3), density=1e3 / 7),
+    vsr.Stiffness(1 / 3, vsr.Taper(1.0, 2 / 3), EA=1e3 / 7, mass=1 / 7),
+    vsr.Stiffness(matrix=np.diag([1 / 3, 0.1, 0.2, 1e3 / 7, 30.0, 40.0])),
+)
+
+
 @pytest.mark.slow
 def test_every_class_comes_back_to_the_last_bit():
     scene = full_scene()
@@ -110,7 +117,15 @@ def test_every_class_comes_back_to_the_last_bit():
     groups = [group for group in scenefile._GROUPS.values() if len(group) > 1]
     assert scenefile._GROUPS["rigid"] == {"RigidPiece": vsr.RigidPiece}
     assert "rigid = [" in text
-    assert [name for group in groups for name in group if f'type = "{name}"' not in text] == []
+    others = [vsr.Scene(vsr.Rod(0.1, vsr.Circular(0.01), x)) for x in OTHER_MATERIALS]
+    texts = "".join([text, *map(to_toml, others)])
+    assert [
+        name
+        for group in groups
+        for name, kind in group.items()
+        if f'type = "{name}"' not in texts and kind not in scenefile._USUAL
+    ] == []
+    assert all(same(parse_scene(to_toml(other)).scene, other) for other in others)
     assert {"Taper", "PolynomialProfile", "SplineProfile", "Piecewise", "Constant"} == set(
         scenefile._PROFILES
     )
