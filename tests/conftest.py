@@ -71,6 +71,18 @@ def with_derivative(function):
     return jax.jit(lambda x: jax.jacfwd(lambda x: (function(x),) * 2, has_aux=True)(x)[::-1])
 
 
+def checked_derivative(function, p, scale, *, rtol=1e-5, atol=1e-10, zero=0.0):
+    """A function of an array as a program, with its derivative, and that derivative at `p`, which
+    is compared with differences by steps of `scale`, and with reverse mode; `zero` is what is
+    rounding in that."""
+    solve = with_derivative(function)
+    forward, reverse = solve(p)[1], jax.jit(jax.jacrev(function))(p)
+    differences = central_differences(lambda unit: solve(p + scale * unit)[0], p.size).T
+    np.testing.assert_allclose(forward * scale, differences, rtol=rtol, atol=atol)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-8, atol=zero)
+    return solve, forward
+
+
 @pytest.fixture(params=["float32", "float64"])
 def dtype(request):
     return jnp.dtype(request.param)

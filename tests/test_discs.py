@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import central_differences, epsilon, with_derivative
+from conftest import checked_derivative, epsilon
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
@@ -270,11 +270,7 @@ def coordinate(p):
 
 def test_gradients_in_both_modes_are_finite_differences():
     p, scale = jnp.array([3.0, 2.0, *PLACED, 0.007]), jnp.array([1e-2, 1e-2, 1e-3, 1e-3, 1e-4])
-    solve, reverse = with_derivative(coordinate), jax.jit(jax.grad(coordinate))(p)
-    forward = solve(p)[1]
-    differences = central_differences(lambda unit: solve(p + scale * unit)[0], 5)
-    np.testing.assert_allclose(forward * scale, differences, rtol=1e-5, atol=1e-9)
-    np.testing.assert_allclose(forward, reverse, rtol=1e-8)
+    _, forward = checked_derivative(coordinate, p, scale, atol=1e-9)
     assert np.all(np.abs(forward) > 1e-4)
 
 
@@ -526,11 +522,7 @@ def test_gradients_by_friction_and_discs():
 
     p = jnp.array([0.2, 0.08, 0.007, 2.0, 2e-3, 4e-3])
     scale = jnp.array([1e-2, 1e-3, 1e-4, 1e-2, 1e-4, 1e-4])
-    solve, reverse = with_derivative(number), jax.jit(jax.grad(number))(p)
-    forward = solve(p)[1]
-    differences = central_differences(lambda unit: solve(p + scale * unit)[0], 6)
-    np.testing.assert_allclose(forward * scale, differences, rtol=1e-5, atol=1e-9)
-    np.testing.assert_allclose(forward, reverse, rtol=1e-8)
+    _, forward = checked_derivative(number, p, scale, atol=1e-9)
     assert np.all(np.abs(forward) > 1e-4)
 
 
@@ -551,12 +543,8 @@ def test_gradients_by_the_spool_and_the_rim():
         return jnp.stack([eq.tip[:3, 3] @ jnp.array([1.0, -2.0, 3.0]), eq.contacts.force.sum()])
 
     p, scale = jnp.array([5e-3, 0.012, 0.4]), jnp.array([1e-4, 1e-4, 1e-2])
-    solve, reverse = with_derivative(number), jax.jit(jax.jacrev(number))(p)
-    found, forward = solve(p)
-    assert found[1] > 1e-3  # touched
-    differences = central_differences(lambda unit: solve(p + scale * unit)[0], 3).T
-    np.testing.assert_allclose(forward * scale, differences, rtol=1e-5, atol=1e-9)
-    np.testing.assert_allclose(forward, reverse, rtol=1e-8)
+    solve, forward = checked_derivative(number, p, scale, atol=1e-9)
+    assert solve(p)[0][1] > 1e-3  # touched
     assert np.all(np.abs(forward) > 1e-4)
 
 

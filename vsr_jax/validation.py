@@ -115,11 +115,7 @@ def rigid(name: str, value: Any) -> Array:
     """
     array = numbers(name, value, (4, 4))
     known = concrete(array)
-    fault = (
-        None
-        if known is None
-        else _fault(known.astype(float), 1e-5 if array.dtype == np.float64 else 1e-3)
-    )
+    fault = None if known is None else _fault(known)
     if fault is not None:
         raise ValueError(
             f"{name}: got {fault}, need a rigid transform, a rotation and a position above the "
@@ -128,11 +124,22 @@ def rigid(name: str, value: Any) -> Array:
     return array
 
 
-def _fault(g: np.ndarray, tolerance: float) -> str | None:
+def _near(matrix: np.ndarray) -> float:
+    """How far a rotation may be from a given matrix: six digits are enough."""
+    return 1e-5 if matrix.dtype == np.float64 else 1e-3
+
+
+def _fault(g: np.ndarray) -> str | None:
     """The property of a pose that a matrix lacks; None for a pose."""
-    R, row = g[:3, :3], g[3]
-    if np.max(np.abs(row - (0, 0, 0, 1))) > tolerance:
+    row = g[3].astype(float)
+    if np.max(np.abs(row - (0, 0, 0, 1))) > _near(g):
         return f"a last row of {' '.join(f'{x:g}' for x in row)}"
+    return rotation_fault(g[:3, :3])
+
+
+def rotation_fault(matrix: np.ndarray) -> str | None:
+    """The property of a rotation that a known matrix lacks; None for a rotation."""
+    R, tolerance = matrix.astype(float), _near(matrix)
     off = np.max(np.abs(R.T @ R - np.eye(3)))
     if off > tolerance:
         return (

@@ -13,18 +13,16 @@ from ..numerics.loops import fori_loop, scan
 from ..numerics.magnus import step_twist
 from ..numerics.quadrature import gauss_legendre
 from ..typing import ArrayLike, MatrixLike, Pose, Scalar, ScalarLike
-from ..validation import concrete, numbers
+from ..validation import concrete, numbers, rotation_fault
 from .placement import pose
 from .profile import FunctionOfX
-from .spline import spline_slopes
+from .spline import spline_rate, spline_slopes
 
 Points = Float[Array, "points 3"]
 Frames = Float[Array, "points 3 3"]
 
 _CORRECTIONS = 6
 """Corrections of the strain, each of which gains the square of the angle from point to point."""
-_NEAR_ROTATION = 1e-5, 1e-3
-"""How far matrices may be from rotations, in double and in single precision."""
 
 
 class RestShape(NamedTuple):
@@ -51,7 +49,7 @@ def rest_shape(points: MatrixLike, frames: ArrayLike | None, roll: ScalarLike) -
     R = None if frames is None else _checked_frames(frames, r)
     start = pose(pointing=_chords(r)[0], roll=roll)[:3, :3].astype(r.dtype)
     *spline, base = _curve(r, R, start)
-    return RestShape(spline[0][-1], FunctionOfX("Rod.through", _rate, *spline), base)
+    return RestShape(spline[0][-1], FunctionOfX("Rod.through", spline_rate, *spline), base)
 
 
 @program("rest shape")
@@ -72,15 +70,6 @@ def _curve(r: Points, R: Frames | None, start: Array) -> tuple[Array, Array, Arr
     return *_spline(X, turns), poses[0]
 
 
-def _rate(X: Scalar, ends: Array, values: Array, slopes: Array) -> Array:
-    """Derivative at X [m] of the cubic spline through `values` at `ends`."""
-    i = jnp.clip(jnp.searchsorted(ends, X, side="right") - 1, 0, ends.size - 2)
-    h = ends[i + 1] - ends[i]
-    s = (X - ends[i]) / h
-    secant, first, last = (values[i + 1] - values[i]) / h, slopes[i], slopes[i + 1]
-    return first + s * (6 * secant - 4 * first - 2 * last + s * 3 * (first + last - 2 * secant))
-
-
 def _spline(X: Array, turns: Array) -> tuple[Array, Array, Array]:
     """Abscissas, values and slopes of the spline with the increments `turns` (pieces, 6)."""
     sums = jnp.concatenate([jnp.zeros_like(turns[:1]), jnp.cumsum(turns, axis=0)])
@@ -92,7 +81,7 @@ def _twists(X: Array, sums: Array, slopes: Array) -> Array:
     nodes = jnp.asarray(gauss_legendre(3)[0], X.dtype)
 
     def twist(start: Scalar, h: Scalar) -> Array:
-        stages = [_rate(start + h * node, X, sums, slopes) for node in nodes]
+        stages = [spline_rate(start + h * node, X, sums, slopes) for node in nodes]
         return step_twist(jnp.stack(stages), h)
 
     return jax.vmap(twist)(X[:-1], jnp.diff(X))
@@ -106,7 +95,7 @@ def _arc_lengths(t: Array, r: Points) -> Array:
     """Arc length [m] of the spline through `r` at the parameters `t`, at its points."""
     nodes, weights = (jnp.asarray(x, t.dtype) for x in gauss_legendre(5))
     places = t[:-1, None] + jnp.diff(t)[:, None] * nodes
-    rates = jax.vmap(lambda x: _rate(x, t, r, slopes))
+    rates = jax.vmap(lambda x: spline_rate(x, t, r, slopes))
     slopes = _slopes(t, r)
     speed = jnp.linalg.norm(jax.vmap(rates)(places), axis=-1)
     lengths = jnp.diff(t) * (speed @ weights)
@@ -161,9 +150,8 @@ def _checked_frames(frames: ArrayLike, r: Points) -> Frames:
     R = numbers(name, frames, (r.shape[0], 3, 3)).astype(r.dtype)
     known, chords = concrete(R), concrete(_chords(r))
     if known is not None:
-        off = np.abs(np.swapaxes(known, 1, 2) @ known - np.eye(3)).max(axis=(1, 2))
-        wrong = (off > _NEAR_ROTATION[R.dtype != np.float64]) | (np.linalg.det(known) < 0)
-        if np.any(wrong):
+        wrong = [rotation_fault(one) is not None for one in known]
+        if any(wrong):
             raise ValueError(f"{name}: got no rotation at point {np.argmax(wrong)}, need rotations")
         if chords is not None:
             along = np.concatenate([chords, chords[-1:]])

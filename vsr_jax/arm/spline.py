@@ -36,12 +36,25 @@ def spline_value(X: ScalarLike, points: Points, values: Points) -> Scalar:
     piece extend beyond the end points.
     """
     slopes = spline_slopes(points, values)
-    i = jnp.clip(jnp.searchsorted(points, X, side="right") - 1, 0, points.size - 2)
-    h = points[i + 1] - points[i]
-    s = (X - points[i]) / h
+    i, h, s = _piece(X, points)
     secant = (values[i + 1] - values[i]) / h
     d0, d1 = slopes[i], slopes[i + 1]
     return values[i] + h * s * (d0 + s * ((3 * secant - 2 * d0 - d1) + s * (d0 + d1 - 2 * secant)))
+
+
+def spline_rate(X: ScalarLike, points: Points, values: Array, slopes: Array) -> Array:
+    """Derivative at X [m] of the spline through `values` (points, ...), from its `slopes`."""
+    i, h, s = _piece(X, points)
+    secant = (values[i + 1] - values[i]) / h
+    d0, d1 = slopes[i], slopes[i + 1]
+    return d0 + s * (2 * (3 * secant - 2 * d0 - d1) + 3 * s * (d0 + d1 - 2 * secant))
+
+
+def _piece(X: ScalarLike, points: Points) -> tuple[Array, Scalar, ScalarLike]:
+    """Index of the piece in which X [m] is, its length, and the share of it before X."""
+    i = jnp.clip(jnp.searchsorted(points, X, side="right") - 1, 0, points.size - 2)
+    h = points[i + 1] - points[i]
+    return i, h, (X - points[i]) / h
 
 
 def spline_slopes(points: Points, values: Points) -> Points:

@@ -13,7 +13,7 @@ from ..validation import concrete, numbers
 from .elasticity import Elasticity
 from .profile import FunctionOfX, Limits, Profile, ProfileLike, as_profile
 from .section import Section
-from .section_law import CoupledLaw, LinearLaw, SectionLaw
+from .section_law import CoupledLaw, SectionLaw
 
 _SYMMETRY = 1e-6
 """Difference of two entries of a matrix, as a share of its diagonal, that is taken for rounding."""
@@ -106,7 +106,7 @@ class Stiffness(Elasticity):
     def law(self, section: Section, X: ScalarLike, length: ScalarLike) -> SectionLaw:
         """The law of a section at X [m], linear."""
         if self.matrix is None:
-            return LinearLaw()
+            return super().law(section, X, length)
         rows = self._matrix(X)
         return CoupledLaw(tuple(tuple(rows[i, j] for j in range(6)) for i in range(6)))
 

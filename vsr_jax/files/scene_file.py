@@ -195,14 +195,19 @@ def kind_of(table: Table, path: str, group: Group) -> type:
     """The class named by the `type` of a table, one of a group."""
     known = ", ".join(sorted(group))
     if "type" not in table:
-        usual = [kind for kind in group.values() if len(group) == 1 or kind in _USUAL]
-        if usual:
-            return usual[0]
+        usual = _usual(group)
+        if usual is not None:
+            return usual
         raise ValueError(f"{path}: missing key 'type', known types are {known}")
     name = table["type"]
     if not isinstance(name, str) or name not in group:
         raise ValueError(f"{path}: unknown type {name!r}, known are {known}{_guess(name, group)}")
     return group[name]
+
+
+def _usual(group: Group) -> type | None:
+    """The class of a table without a type; None if it needs one."""
+    return next((kind for kind in group.values() if len(group) == 1 or kind in _USUAL), None)
 
 
 def build(kind: type, table: Table, path: str) -> Any:
@@ -292,7 +297,7 @@ def _write(value: Any, path: str, group: Group) -> Any:
             f"{', '.join(sorted(group))}"
         )
     table = _arguments(value, path)
-    return table if len(group) == 1 or type(value) in _USUAL else {"type": name} | table
+    return table if type(value) is _usual(group) else {"type": name} | table
 
 
 def _numbers(value: Any, path: str) -> Any:

@@ -66,7 +66,7 @@ def energy_of(
     for i, path in enumerate(nodes.sections.paths):
         if i in driven:
             cables = cables + _stretch(scene, inputs, forces, nodes, i)
-        elif i in scene.law_driven:
+        elif i in scene.law_driven and i not in scene.frictional:
             thread = driven_of(scene, inputs[i], i, nodes.sections, nodes.grid)
             length = thread_length(scene, nodes.xi, nodes.sections, i, nodes.grid)
             state = ThreadState(forces[i], length, thread.rest, thread.scale)

@@ -163,11 +163,11 @@ def arm_of(scene: Scene, inputs: Array, forces: Vector, nodes: Nodes) -> ScaledT
             length = thread_length(scene, xi, sections, place, grid)
             share = nodes.shares[place]
             law = thread.law(-forces[place], length, share, grid)
-            gives = thread.gives(law, share, grid)
+            gives = thread.gives(law, share, grid)[None]
             rigid = gives == 0  # as a chamber of given volume
-            stiffness = jnp.where(rigid, 0.0, -law.by_length / jnp.where(rigid, 1.0, gives))
-            springs.append(_springs(row, stiffness[None], scale, scene.free))
-            ties.append(_ties(row, rigid[None], scale, scene.free))
+            spring = _spring(-law.by_length, gives, rigid)
+            springs.append(_springs(row, spring, scale, scene.free))
+            ties.append(_ties(row, rigid, scale, scene.free))
     return _tied(problem, ArmUnknown(xi, ()), units, ties, springs, scene.free)
 
 
@@ -189,9 +189,8 @@ def _supported(problem: ArmProblem, unknown: ArmUnknown, free: tuple[int, ...]) 
             if border is None:
                 continue
             rows, corner = border.rows, border.corner
-            gives = corner >= _HOLDING
-            stiffness = jnp.where(gives, -border.factors / jnp.where(gives, corner, 1.0), 0.0)
-            springs.append(_springs(rows, stiffness, scale, free))
+            spring = _spring(-border.factors, corner, corner < _HOLDING)
+            springs.append(_springs(rows, spring, scale, free))
         ties.append(_ties(rows, corner < _HOLDING, scale, free))
     return _tied(problem, unknown, units, ties, springs, free)
 
@@ -247,6 +246,12 @@ def _ties(
     )
     holds &= size > jnp.sqrt(jnp.finfo(size.dtype).eps) * whole
     return jnp.where(holds, 1 / jnp.where(holds, size, 1.0), 0.0)[:, None] * row
+
+
+def _spring(push: Array, gives: Array, rigid: Array) -> Array:
+    """Stiffness of what holds the arm: its force by its length over its force by its own unknown;
+    zero where it is rigid, a tie."""
+    return jnp.where(rigid, 0.0, push / jnp.where(rigid, 1.0, gives))
 
 
 def _springs(
