@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from conftest import checked_derivative, epsilon
+from conftest import central_differences, checked_derivative, epsilon
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
