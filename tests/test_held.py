@@ -1,5 +1,6 @@
 """Held sections against closed forms, free bodies and finite differences."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +13,8 @@ from scipy.special import ellipe, ellipk
 from test_contact import MODEL, NO_INPUTS, L, rod, solved, stiffness
 
 import vsr_jax as vsr
+from vsr_jax.arm import Frame, PoseLoad, Support
+from vsr_jax.typing import Scalar
 
 BENDING = ("bending_y", "bending_z")
 
@@ -41,6 +44,54 @@ def test_the_margin_of_a_held_column_vanishes_at_its_buckling_load(orientation, 
         model=vsr.StrainDependent(24),
     )
     np.testing.assert_allclose(eq.stability, 0.5, atol=1e-7)
+
+
+class Sleeve(Support):
+    """The tip stays on the x axis and along it, and is free to slide and to turn about it."""
+
+    X = None
+    effect = "sleeve"
+    units = ("m", "m", "rad", "rad")
+
+    def deviation(self, base, rotation, position):
+        return jnp.stack((position[1], position[2], rotation[1, 0], rotation[2, 0]))
+
+
+class Torque(PoseLoad):
+    """A torque about the x axis by its potential, where the tip stays along that axis."""
+
+    torque: Scalar
+    frame: Frame = eqx.field(static=True, default="world", init=False)
+    effect = "torque"
+    needs = "rotation"
+
+    def place(self, rod):
+        return rod.length
+
+    def potential(self, rod, X, R, position):
+        return -self.torque * jnp.arctan2(R[2, 1] - R[1, 2], R[1, 1] + R[2, 2])
+
+
+@pytest.mark.slow
+def test_a_twisted_rod_under_tension_buckles_at_greenhills_torque():
+    """Clamped rods: M L / EI = 8.986819, 9.134730, 10.428856, 13.113500 for T L^2 / EI = 0, 1, 10,
+    30 (Greenhill 1883, inextensible; a rod of this slenderness is 0.1 % off at most)."""
+    arm, EI = vsr.Rod(1.0, vsr.Circular(0.01), vsr.Material(1e6, poisson=0.5)), 2.5e-3 * np.pi
+    critical = np.array([8.986819, 9.134730, 10.428856, 13.113500])
+    tension, share = np.repeat([0.0, 1.0, 10.0, 30.0], 3), np.tile([0.98, 0.995, 1.005], 4)
+
+    def outcome(tension, torque):
+        pull = vsr.TipWrench(force=(tension * EI, 0.0, 0.0))
+        scene = vsr.Scene(arm, loads=[pull, Torque(torque * EI)], held=Sleeve())
+        eq = vsr.solve(scene, [])
+        return eq.stability, eq.status
+
+    margin, status = jax.jit(jax.vmap(outcome))(tension, share * np.repeat(critical, 3))
+    margin, status = margin.reshape(4, 3), status.reshape(4, 3)
+    assert (status[:, :2] == vsr.Status.CONVERGED).all()
+    assert (status[:, 2] != vsr.Status.CONVERGED).all()
+    vanishes = 0.995 + 0.015 * margin[:, 1] / (margin[:, 0] - margin[:, 1])
+    np.testing.assert_allclose(vanishes, 1.0, atol=1e-3)
 
 
 @pytest.mark.slow

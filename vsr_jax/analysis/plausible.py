@@ -222,10 +222,11 @@ def _measured(scene: Scene) -> _Measures:
         thickness = rod.section.clearance(zero, zero, x, rod.length)
         wide = thickness if rod.rim is None else jnp.maximum(thickness, rod.rim)
         area = jnp.maximum(rod.section.geometry(x, rod.length).area, jnp.pi * wide**2)
+        limits = rod.material.limits(rod.section, x, rod.length)
         return _Measures(
             thickness,
             area,
-            {name: value for (name, _), (value, _) in rod.material.limits(x, rod.length).items()},
+            {name: value for (name, _), (value, _) in limits.items()},
         )
 
     return jax.vmap(at)(jnp.linspace(0, 1, _STATIONS) * rod.length)

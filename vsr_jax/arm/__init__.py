@@ -5,11 +5,12 @@ Data and their geometry only. Must not know how an equilibrium is found or how a
 """
 
 from .actuator import Actuator, Chamber, Tendon, Thread, ThreadState
+from .composite import Composite, Inclusion
 from .discs import Discs
 from .elasticity import Elasticity
 from .held import Held, Support
 from .loads import DistributedWrench, Frame, Gravity, Load, PointWrench, TipWrench
-from .material import Material, NeoHookean
+from .material import Material
 from .obstacles import Box, Cylinder, Field, Obstacle, Plane, Sphere
 from .placement import pose
 from .pose_loads import (
@@ -32,6 +33,7 @@ from .profile import (
 from .rigid_piece import RigidPiece
 from .rod import STRAINS, Rod
 from .routing import Function, Helix, Linear, Parallel, Polynomial, Routing, Spline
+from .rubber import NeoHookean, Ogden
 from .scene import CrossSections, Scene
 from .scene_numbers import Parameter, parameters
 from .section import Annular, Circular, Elliptic, Joined, Rectangular, Section
@@ -46,6 +48,7 @@ __all__ = [
     "Box",
     "Chamber",
     "Circular",
+    "Composite",
     "Constant",
     "CrossSections",
     "Cylinder",
@@ -60,6 +63,7 @@ __all__ = [
     "Gravity",
     "Held",
     "Helix",
+    "Inclusion",
     "Joined",
     "Linear",
     "LinearLaw",
@@ -69,6 +73,7 @@ __all__ = [
     "Material",
     "NeoHookean",
     "Obstacle",
+    "Ogden",
     "Parallel",
     "Parameter",
     "Payload",

@@ -120,12 +120,17 @@ class Actuator(Part):
 
     def reach(self, X: ScalarLike) -> Array | None:
         """1 between the thread's ends, 0 elsewhere; None if it extends over the whole arm."""
-        if self.start is None and self.end is None:
-            return None
-        here = jnp.ones_like(X)
-        if self.start is not None:
-            here = jnp.where(self.start <= X, here, 0.0)
-        return here if self.end is None else jnp.where(self.end > X, here, 0.0)
+        return between(self.start, self.end, X)
+
+
+def between(start: Scalar | None, end: Scalar | None, X: ScalarLike) -> Array | None:
+    """1 between two abscissas, 0 elsewhere; None without ends."""
+    if start is None and end is None:
+        return None
+    here = jnp.ones_like(X)
+    if start is not None:
+        here = jnp.where(start <= X, here, 0.0)
+    return here if end is None else jnp.where(end > X, here, 0.0)
 
 
 def _checked(

@@ -43,8 +43,8 @@ class Elasticity(Part):
         return ()
 
     @abstractmethod
-    def limits(self, X: ScalarLike, length: ScalarLike) -> Limits:
-        """Its numbers and their limits."""
+    def limits(self, section: Section, X: ScalarLike, length: ScalarLike) -> Limits:
+        """Its numbers and their limits, in a section."""
 
     @property
     @abstractmethod

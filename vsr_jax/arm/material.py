@@ -9,8 +9,7 @@ from ..numerics.component import Vector
 from ..typing import Scalar, ScalarLike
 from .elasticity import Elasticity
 from .profile import Limits, Profile, ProfileLike, as_profile
-from .section import Section
-from .section_law import NeoHookeanLaw, SectionLaw
+from .section import Geometry, Section
 
 LEAST_POISSON, MOST_POISSON = -1.0, 0.5
 """Range of Poisson's ratio of a stable isotropic material; the lower bound is excluded."""
@@ -60,7 +59,7 @@ class Material(Elasticity):
         assert self.poisson is not None
         return self.young(X, length) / (2 + 2 * self.poisson(X, length))
 
-    def limits(self, X: ScalarLike, length: ScalarLike) -> Limits:
+    def limits(self, section: Section, X: ScalarLike, length: ScalarLike) -> Limits:
         """The properties at X [m] and their limits."""
         given = {
             name: p
@@ -77,14 +76,8 @@ class Material(Elasticity):
 
     def stiffness(self, section: Section, X: ScalarLike, length: ScalarLike) -> Vector:
         """Diagonal of $\\Sigma(X)$, six scalars [N m^2] and [N]."""
-        shape, E, G = (
-            section.geometry(X, length),
-            self.young(X, length),
-            self.shear_modulus(X, length),
-        )
-        angular = (G * shape.torsion, E * shape.moment_y, E * shape.moment_z)
-        shear_y, shear_z = (kappa * G * shape.area for kappa in shape.shear_factors)
-        return (*angular, E * shape.area, shear_y, shear_z)
+        shape = section.geometry(X, length)
+        return isotropic_stiffness(shape, self.young(X, length), self.shear_modulus(X, length))
 
     @property
     def weighs(self) -> bool:
@@ -106,24 +99,8 @@ class Material(Elasticity):
         return tuple(x for profile in profiles for x in profile.breakpoints)
 
 
-class NeoHookean(Material):
-    r"""Incompressible rubber, $W = \frac{E}{6} (I_1 - 3)$ per volume: the sections become smaller
-    as the arm stretches, $A / \lambda$. A bar carries $N = \frac{EA}{3} (\lambda - \lambda^{-2})$,
-    and resists bending with $\frac{EJ}{3} (1 + 2 \lambda^{-3})$ and twist with $GJ / \lambda$,
-    where $G = E / 3$. Valid where the strain by bending and twist is moderate.
-
-    Small strains are those of a `Material` with `poisson=0.5`. The paths of threads and the areas
-    of chambers do not shrink with the section.
-
-    **Arguments**, profiles: `young` $E$ [Pa] at small strains; `density` [kg/m^3], required only by
-    `Gravity`.
-    """
-
-    def __init__(self, young: ProfileLike, density: ProfileLike | None = None):
-        super().__init__(young, poisson=MOST_POISSON, density=density)
-
-    def law(self, section: Section, X: ScalarLike, length: ScalarLike) -> SectionLaw:
-        return NeoHookeanLaw()
-
-    def moduli(self, X: ScalarLike, length: ScalarLike) -> None:
-        """None: stress is not $E$ times the strain."""
+def isotropic_stiffness(shape: Geometry, E: Scalar, G: Scalar) -> Vector:
+    """Diagonal of $\\Sigma$, six scalars [N m^2] and [N], of a section of one material."""
+    angular = (G * shape.torsion, E * shape.moment_y, E * shape.moment_z)
+    shear_y, shear_z = (kappa * G * shape.area for kappa in shape.shear_factors)
+    return (*angular, E * shape.area, shear_y, shear_z)

@@ -172,7 +172,7 @@ class Rod(Part):
         """Sizes, material properties and rest elongation at X [m] and their limits."""
         parts = {
             "section": self.section.limits(X, self.length),
-            "material": self.material.limits(X, self.length),
+            "material": self.material.limits(self.section, X, self.length),
         }
         found = {
             (f"{part}.{name}", needed): pair

@@ -10,7 +10,7 @@ from abc import abstractmethod
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from ..numerics.component import Matrix, Vector, dot, matvec, multiply
 
@@ -63,6 +63,11 @@ class CoupledLaw(SectionLaw):
 
     matrix: Matrix
 
+    @staticmethod
+    def of(matrix: Float[Array, "6 6"]) -> "CoupledLaw":
+        """The law of a matrix that is symmetric."""
+        return CoupledLaw(tuple(tuple(matrix[i, j] for j in range(6)) for i in range(6)))
+
     def energy(self, strain: Vector, stiffness: Vector) -> Array:
         return 0.5 * dot(self.wrench(strain, stiffness), strain)
 
@@ -71,21 +76,3 @@ class CoupledLaw(SectionLaw):
 
     def tangent(self, strain: Vector, stiffness: Vector) -> Matrix:
         return tuple(row[: i + 1] for i, row in enumerate(self.matrix))
-
-
-class NeoHookeanLaw(SectionLaw):
-    r"""Rubber, see `vsr_jax.NeoHookean`: with the stretch $\lambda = 1 + \varepsilon_{u,x}$,
-
-    $$W = \tfrac{EA}{6} (\lambda^2 + \tfrac{2}{\lambda} - 3) + \tfrac16 (1 + \tfrac{2}{\lambda^3})
-    (EJ_y k_y^2 + EJ_z k_z^2) + \tfrac{GJ_x}{2 \lambda} k_x^2 + \tfrac12 GA (u_y^2 + u_z^2).$$
-
-    **Source:** the energy $\frac{E}{6} (I_1 - 3)$ of an incompressible bar that is stretched, and
-    to second order bent, twisted and sheared, integrated over the section.
-    """
-
-    def energy(self, strain: Vector, stiffness: Vector) -> Array:
-        (kx, ky, kz, stretched, uy, uz), (GJ, EJy, EJz, EA, GAy, GAz) = strain, stiffness
-        stretch = 1 + stretched
-        axial = EA / 6 * (stretch**2 + 2 / stretch - 3)
-        bent = (1 + 2 / stretch**3) / 6 * (EJy * ky**2 + EJz * kz**2)
-        return axial + bent + 0.5 * (GJ * kx**2 / stretch + GAy * uy**2 + GAz * uz**2)

@@ -107,8 +107,7 @@ class Stiffness(Elasticity):
         """The law of a section at X [m], linear."""
         if self.matrix is None:
             return super().law(section, X, length)
-        rows = self._matrix(X)
-        return CoupledLaw(tuple(tuple(rows[i, j] for j in range(6)) for i in range(6)))
+        return CoupledLaw.of(self._matrix(X))
 
     @property
     def weighs(self) -> bool:
@@ -126,7 +125,7 @@ class Stiffness(Elasticity):
         strains |= {"shear_y": self.GA_y, "shear_z": self.GA_z}
         return tuple(name for name, stiffness in strains.items() if stiffness is None)
 
-    def limits(self, X: ScalarLike, length: ScalarLike) -> Limits:
+    def limits(self, section: Section, X: ScalarLike, length: ScalarLike) -> Limits:
         values = {name: profile(X, length) for name, profile in self._profiles.items()}
         found = {(name, "a number > 0"): (value, value) for name, value in values.items()}
         if self.matrix is not None:

@@ -22,17 +22,19 @@ import tomli_w
 from jaxtyping import Array, Float
 
 from ..arm.actuator import Chamber, Tendon, Thread
+from ..arm.composite import Composite, Inclusion
 from ..arm.discs import Discs
 from ..arm.fields import arguments
 from ..arm.held import Held
 from ..arm.loads import DistributedWrench, Gravity, PointWrench, TipWrench
-from ..arm.material import Material, NeoHookean
+from ..arm.material import Material
 from ..arm.obstacles import Box, Cylinder, Plane, Sphere
 from ..arm.pose_loads import MagneticDensity, MagneticMoment, Payload, Spinning, Spring
 from ..arm.profile import Constant, Piecewise, PolynomialProfile, SplineProfile, Taper
 from ..arm.rigid_piece import RigidPiece
 from ..arm.rod import Rod
 from ..arm.routing import Helix, Linear, Parallel, Polynomial, Spline
+from ..arm.rubber import NeoHookean, Ogden
 from ..arm.scene import Scene
 from ..arm.section import Annular, Circular, Elliptic, Joined, Rectangular
 from ..arm.stiffness import Stiffness
@@ -57,7 +59,8 @@ _GROUPS = {
     "rod": _group(Rod),
     "discs": _group(Discs),
     "rigid": _group(RigidPiece),
-    "material": _group(Material, NeoHookean, Stiffness),
+    "material": _group(Material, NeoHookean, Ogden, Composite, Stiffness),
+    "inclusions": _group(Inclusion),
     "section": _SECTIONS,
     "sections": _SECTIONS,
     "routing": _group(Parallel, Linear, Helix, Polynomial, Spline),
