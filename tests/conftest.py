@@ -48,6 +48,11 @@ from vsr_jax.studies import paper  # noqa: E402
 compiling.SILENT = 1e6
 
 
+def pytest_configure(config):
+    # scenes of tests have any size; here for the import hook above, which pyproject.toml precedes
+    config.addinivalue_line("filterwarnings", "ignore::vsr_jax.UnitWarning")
+
+
 def epsilon(dtype) -> float:
     """Machine epsilon: tolerances are written as multiples of it."""
     return float(jnp.finfo(dtype).eps)

@@ -107,7 +107,7 @@ def test_solve_prints_the_result_in_words(solved):
 def test_a_solve_that_fails_says_why(collapsed):
     assert collapsed.code == cli_common.NOT_CONVERGED
     assert re.search(r"status +collapsed: ", collapsed.out)
-    drawn, doubted = collapsed.err.splitlines()
+    doubted, drawn = collapsed.err.splitlines()
     assert drawn.endswith("arm.png: the solve failed, so it shows the arm at rest")
     assert doubted.startswith("vsr-jax: warning: inputs[0]: -5000 N would strain a section by ")
     assert (collapsed.folder / "arm.png").stat().st_size > 10_000

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import pytest
 
 import vsr_jax as vsr
-from vsr_jax.analysis import plausible
 from vsr_jax.analysis.health import Limit
 from vsr_jax.cli import common as cli_common, main as cli
 from vsr_jax.files.scene_file import load
 from vsr_jax.optimization import design_search
+from vsr_jax.solution.plausible_strain import strain_warnings
 from vsr_jax.studies import paper
 
 FOLDER = pathlib.Path(__file__).parents[1] / "notebooks"
@@ -85,9 +85,13 @@ def arm(*, length=0.3, radius=0.01, young=1e6, shear=3e5, density=1e3, rim=0.02,
     ids=lambda value: " ".join(value) if isinstance(value, dict) else "",
 )
 def test_a_wrong_unit_is_named(numbers, sentence):
-    found = plausible.warnings_of(arm(**numbers))
+    with pytest.warns(vsr.UnitWarning) as told:
+        found = arm(**numbers).warnings
     assert len(found) == 1
     assert found[0].startswith(sentence)
+    (warning,) = told
+    assert str(warning.message) == found[0]
+    assert warning.filename == __file__
 
 
 @pytest.mark.parametrize(
@@ -104,13 +108,20 @@ def test_a_wrong_unit_is_named(numbers, sentence):
 def test_doubtful_gravity_is_named(acceleration, sentence):
     scene = arm()
     heavy = vsr.Scene(scene.rod, scene.actuators, vsr.Gravity(acceleration))
-    assert plausible.warnings_of(heavy) == (sentence,)
+    assert heavy.warnings == (sentence,)
+
+
+def test_the_materials_of_a_composite_are_named():
+    wire = vsr.Inclusion(vsr.Parallel(0.0, 0.0), 1e-3, vsr.Material(200.0, poisson=0.3))
+    rod = vsr.Rod(0.3, vsr.Circular(0.01), vsr.Composite(vsr.Material(1e6, poisson=0.5), wire))
+    (sentence,) = vsr.Scene(rod).warnings
+    assert sentence.startswith("rod.material.inclusions[0].material.young: 200 Pa; materials")
 
 
 def test_stiffness_that_no_section_has_is_named():
     def told(EI):
         rod = vsr.Rod(0.3, vsr.Circular(0.01), vsr.Stiffness(EI, EA=300.0))
-        return plausible.warnings_of(vsr.Scene(rod))
+        return vsr.Scene(rod).warnings
 
     assert told(7.5e-3) == ()
     (first, _) = told(7.5)
@@ -128,24 +139,26 @@ def test_a_tension_beyond_what_the_arm_bears_is_named(aside):
     area, bending = jnp.pi * 0.01**2, 1e6 * jnp.pi / 4 * 0.01**4
     tension = 5000.0
     strain = max(tension / (1e6 * area), tension * aside * 0.01 / bending)
-    eq = vsr.solve(scene, [tension], model=vsr.StrainDependent(4))
+    with pytest.warns(vsr.UnitWarning, match=r"inputs\[0\]: 5000 N would") as told:
+        eq = vsr.solve(scene, [tension], model=vsr.StrainDependent(4))
     assert not eq.converged
-    (sentence,) = plausible.strain_warnings(eq)
+    assert [warning.filename for warning in told] == [__file__]
+    (sentence,) = strain_warnings(eq)
     assert sentence.startswith(f"inputs[0]: 5000 N would strain a section by {strain:.2g}; ")
     assert sentence.endswith("is it in mN?")
     fine = vsr.solve(scene, [tension * 1e-3], model=vsr.StrainDependent(4))
-    assert plausible.strain_warnings(fine) == ()
+    assert strain_warnings(fine) == ()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
 def test_the_examples_are_plausible(path):
-    assert plausible.warnings_of(load(path).scene) == ()
+    assert load(path).scene.warnings == ()
 
 
 @pytest.mark.parametrize("case", ["A1", "B2", "C1"])
 def test_the_papers_arms_are_plausible(case):
-    assert plausible.warnings_of(paper.scene(case)) == ()
+    assert paper.scene(case).warnings == ()
 
 
 def test_ordinary_arms_are_plausible():
@@ -154,7 +167,7 @@ def test_ordinary_arms_are_plausible():
         {"young": 5e4, "shear": 2e4},
         {"length": 1.5, "radius": 3e-4, "young": 2e11, "shear": 8e10, "density": 7800.0},
     ):
-        assert plausible.warnings_of(arm(**numbers)) == ()
+        assert arm(**numbers).warnings == ()
 
 
 def test_large_strains_are_named_and_failed_or_traced_solves_are_not(helix):
@@ -164,17 +177,15 @@ def test_large_strains_are_named_and_failed_or_traced_solves_are_not(helix):
     def solved(strain):
         return vsr.solve(soft, [strain * stretch], model=vsr.StrainDependent(4))
 
-    assert plausible.strain_warnings(solved(0.4)) == ()
-    (sentence,) = plausible.strain_warnings(solved(0.8))
+    assert strain_warnings(solved(0.4)) == ()
+    (sentence,) = strain_warnings(solved(0.8))
     assert sentence.startswith("strain: up to 0.8; beyond 0.5 a linear material is doubtful")
-    assert plausible.strain_warnings(solved(-1.5)) == ()
+    assert strain_warnings(solved(-1.5)) == ()
     said = []
     jax.jit(
-        lambda u: said.extend(
-            plausible.strain_warnings(vsr.solve(soft, u, model=vsr.StrainDependent(4)))
-        )
+        lambda u: said.extend(strain_warnings(vsr.solve(soft, u, model=vsr.StrainDependent(4))))
     )(jnp.array([0.8 * stretch]))
-    jax.jit(lambda length: said.extend(plausible.warnings_of(arm(length=length))))(400.0)
+    jax.jit(lambda length: said.extend(arm(length=length).warnings))(400.0)
     assert said == []
 
 

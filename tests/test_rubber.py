@@ -8,8 +8,8 @@ from conftest import checked_derivative
 from scipy.optimize import brentq, fsolve
 
 import vsr_jax as vsr
-from vsr_jax.analysis import plausible
 from vsr_jax.files.scene_file import parse_scene, to_toml
+from vsr_jax.solution.plausible_strain import strain_warnings
 from vsr_jax.viewer.coloring import colorings_of
 
 LENGTH, RADIUS, YOUNG = 0.3, 0.01, 1e6
@@ -230,7 +230,7 @@ def test_large_strains_are_no_reason_to_doubt_rubber():
     linear = vsr.Rod(LENGTH, vsr.Circular(RADIUS), vsr.Material(YOUNG, poisson=0.5))
     pull = vsr.TipWrench(force=(EA, 0, 0))
     scenes = [vsr.Scene(rod, loads=pull, free_strains="elongation") for rod in (linear, ROD)]
-    told = [plausible.strain_warnings(vsr.solve(x, [], model=STEPS)) for x in scenes]
+    told = [strain_warnings(vsr.solve(x, [], model=STEPS)) for x in scenes]
     assert len(told[0]) == 1
     assert told[1] == ()
     assert "stress" not in colorings_of(vsr.Scene(ROD))

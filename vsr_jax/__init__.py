@@ -74,6 +74,7 @@ if TYPE_CHECKING:
         Thread,
         TipWrench,
         Tube,
+        UnitWarning,
         parameters,
         pose,
     )
@@ -223,6 +224,7 @@ __all__ = [
     "TipWrench",
     "Trigonometric",
     "Tube",
+    "UnitWarning",
     "Unknown",
     "View",
     "actuation_matrix",

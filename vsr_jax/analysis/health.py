@@ -23,10 +23,10 @@ from ..numerics.component import free_components, norm, scale, split, times
 from ..numerics.loops import scan
 from ..numerics.quadrature import make_grid
 from ..solution.equilibrium import Equilibrium
+from ..solution.plausible_strain import strain_warnings
 from ..solution.solver import solve
 from ..typing import ArrayLike, DTypeLike, Scalar
 from ..validation import is_traced
-from .plausible import strain_warnings, warnings_of
 
 LEAST_FACTOR, MOST_FACTOR = 1e-4, 1e4
 """Range of the factors."""
@@ -89,7 +89,7 @@ class Health(NamedTuple):
     @property
     def warnings(self) -> tuple[str, ...]:
         """Sentences about implausible numbers, most often a wrong unit; none under `jax.jit`."""
-        return (*warnings_of(self.equilibrium.scene), *strain_warnings(self.equilibrium))
+        return (*self.equilibrium.scene.warnings, *strain_warnings(self.equilibrium))
 
     @property
     def advice(self) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ from .loads import DistributedWrench, Frame, Gravity, Load, PointWrench, TipWren
 from .material import Material
 from .obstacles import Box, Cylinder, Field, Obstacle, Plane, Sphere
 from .placement import pose
+from .plausible import UnitWarning
 from .pose_loads import (
     MagneticDensity,
     MagneticMoment,
@@ -104,6 +105,7 @@ __all__ = [
     "ThreadState",
     "TipWrench",
     "Tube",
+    "UnitWarning",
     "parameters",
     "pose",
 ]

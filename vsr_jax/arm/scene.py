@@ -20,6 +20,7 @@ from .description import Part, describe, described_arguments, table
 from .held import Support
 from .loads import Frame, Load
 from .obstacles import Obstacle
+from .plausible import warn
 from .pose_loads import PoseLoad
 from .rod import STRAINS, Rod
 from .routing import Path
@@ -108,6 +109,8 @@ class Scene(Part):
     - there is gravity, and the material has no density or the stiffness no mass,
     - an obstacle has no size, a tube is narrower than the arm, or the arm starts inside an obstacle
       or outside a tube.
+
+    **Warns:** `UnitWarning` of numbers far outside of what arms have, such as `length=400`.
 
     Only known numbers are checked, not those traced by `jax.jit`.
     """
@@ -401,9 +404,16 @@ class Scene(Part):
         precise("dtype", jnp.zeros((), dtype))
         return cast(self, dtype)
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences about implausible numbers, most often a wrong unit; none for traced numbers."""
+        if any(is_traced(leaf) for leaf in jax.tree.leaves(self)):
+            return ()
+        return check_numbers(self.rod, self.actuators, self.loads, self.edges)
+
     def _check_numbers(self) -> None:
         if not any(is_traced(leaf) for leaf in jax.tree.leaves(self)):
-            check_numbers(self.rod, self.actuators, self.loads, self.edges)
+            warn(self.warnings)
             check_held(self.rod, self.held)
             check_obstacles(self.rod, self.obstacles, self.edges)
 

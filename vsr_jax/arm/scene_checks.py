@@ -17,6 +17,7 @@ from .discs import SAME, Discs
 from .held import Support
 from .loads import Load
 from .obstacles import Obstacle
+from .plausible import Measures, doubts, measures_at
 from .profile import Limits
 from .rigid_piece import check_pieces
 from .rod import Rod
@@ -32,9 +33,11 @@ def check_numbers(
     actuators: Sequence[Actuator],
     loads: Sequence[Load],
     edges: Callable[[], Float[Array, " edges"]],
-) -> None:
-    """Raises `ValueError` for a size or a property beyond its limits, a thread outside the section,
-    and a thread end or a load beyond the arm.
+) -> tuple[str, ...]:
+    """Sentences about implausible numbers of a scene.
+
+    **Raises:** `ValueError` for a size or a property beyond its limits, a thread outside the
+    section, and a thread end or a load beyond the arm.
 
     **Arguments:** `edges`: function that returns the ends of the smooth pieces of the arm [m]; it
     is called after the check of the length.
@@ -43,8 +46,8 @@ def check_numbers(
     _check_places(length, rod, actuators, loads)
     probe = _probe(rod, tuple(actuators), edges())
     if any(map(is_traced, jax.tree.leaves(probe))):
-        return
-    X, limited, clearances = jax.tree.map(np.asarray, probe)
+        return ()
+    X, limited, clearances, measures = jax.tree.map(np.asarray, probe)
     for (name, needed), (values, room) in limited.items():
         if not np.all(room > 0):
             i, unit = int(np.argmin(room)), " m" if name.startswith("section") else ""
@@ -65,6 +68,7 @@ def check_numbers(
                 f"Scene.actuators[{i}].routing: the thread is {-values[j]:.3g} m outside the "
                 f"{outside} at X = {X[j]:g} m; need a path inside {needed}"
             )
+    return tuple(doubts(rod, actuators, loads, measures))
 
 
 def _check_places(
@@ -141,9 +145,9 @@ def check_held(rod: Rod, held: Sequence[Support]) -> None:
 @program("Scene")
 def _probe(
     rod: Rod, actuators: tuple[Actuator, ...], edges: Array
-) -> tuple[Array, Limits, list[Array]]:
-    """Abscissas X [m] along the arm and, at each, the numbers of the rod that have limits and the
-    clearance of each thread [m]."""
+) -> tuple[Array, Limits, list[Array], Measures]:
+    """Abscissas X [m] along the arm and, at each, the numbers of the rod that have limits, the
+    clearance of each thread [m] and what tells whether numbers are plausible."""
     # between the breakpoints too, where a short piece may lie between evenly spaced abscissas
     X = jnp.concatenate(
         [jnp.linspace(0, 1, _PROBES) * rod.length, edges, 0.5 * (edges[1:] + edges[:-1])]
@@ -157,6 +161,7 @@ def _probe(
         X,
         jax.vmap(rod.limits)(X),
         [jax.vmap(lambda x, a=a: clearance(a, x))(X) for a in actuators],
+        jax.vmap(lambda x: measures_at(rod, x))(X),
     )
 
 

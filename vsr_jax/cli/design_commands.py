@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from ..analysis.plausible import warnings_of
 from ..files.output import write_json
 from ..files.scene_file import save
 from .common import (
@@ -19,7 +18,6 @@ from .common import (
     command,
     draw_without_display,
     set_precision,
-    warn,
 )
 
 
@@ -71,7 +69,6 @@ def _design(options: argparse.Namespace) -> int:
     set_precision(options.precision)
     check_folders(options.out, options.json, options.plot, options.checkpoint)
     problem = load_design(options.problem)
-    warn(warnings_of(problem.scene))
     inputs = np.asarray(problem.inputs, options.precision)
     found = design(
         problem.scene,

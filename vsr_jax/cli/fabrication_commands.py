@@ -2,8 +2,8 @@
 
 import argparse
 
-from ..analysis.plausible import strain_warnings, warnings_of
 from ..files.scene_file import load
+from ..solution.plausible_strain import strain_warnings
 from ..solution.solver import solve
 from .common import (
     DONE,
@@ -86,17 +86,16 @@ def _export(options: argparse.Namespace) -> int:
             )
         set_precision(options.precision)
         arm, _, title = load(options.scene)
-        warn(warnings_of(arm))
     else:
         task = task_of(options)
         arm, title = (
             solve(task.scene, task.inputs, model=task.model, tolerance=options.tolerance),
             task.title,
         )
-        warn(strain_warnings(arm))
         if not bool(arm.converged):
             print("\n".join((title or options.scene, *arm.heading)))
             return NOT_CONVERGED
+        warn(strain_warnings(arm))
     made = fabrication_of(
         arm,
         bore=options.bore[0] if options.bore and len(options.bore) == 1 else options.bore,

@@ -6,8 +6,8 @@ import textwrap
 import jax.numpy as jnp
 import numpy as np
 
-from ..analysis.plausible import strain_warnings
 from ..files.output import write_json
+from ..solution.plausible_strain import strain_warnings
 from . import report
 from .common import (
     DONE,

@@ -4,12 +4,13 @@ targets, reproduces the paper, measures costs."""
 import argparse
 import os
 import sys
+import warnings
 from collections.abc import Sequence
 from importlib import import_module
 from typing import NamedTuple
 
 from .. import __version__
-from .common import BAD_USAGE, EXIT_CODES
+from .common import BAD_USAGE, EXIT_CODES, warn
 
 
 class Command(NamedTuple):
@@ -93,11 +94,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = _parser(arguments[:1]).parse_args(arguments)
     if getattr(options, "no_cache", False):
         os.environ["VSR_JAX_CACHE"] = "off"
-    try:
-        return options.run(options)
-    except (ValueError, OSError, ImportError) as error:
-        print(f"vsr-jax: {' '.join(str(error).split())}", file=sys.stderr)
-        return BAD_USAGE
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", UserWarning)
+        warnings.showwarning = lambda message, *_: warn([str(message)])
+        try:
+            return options.run(options)
+        except (ValueError, OSError, ImportError) as error:
+            print(f"vsr-jax: {' '.join(str(error).split())}", file=sys.stderr)
+            return BAD_USAGE
 
 
 def _spaced(argument: str) -> str:

@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Array
 
 from ..analysis.health import check
-from ..analysis.plausible import strain_warnings, warnings_of
 from ..arm.scene import Scene
 from ..files.output import write_json
 from ..files.scene_file import load
@@ -20,6 +19,7 @@ from ..models.basis import Basis, Legendre
 from ..models.prescribed import Prescribed
 from ..models.strain_dependent import StrainDependent
 from ..solution.equilibrium import Equilibrium
+from ..solution.plausible_strain import strain_warnings
 from ..solution.solver import solve
 from ..solution.step_choice import plan
 from .common import (
@@ -149,7 +149,7 @@ def read_task(
     *,
     at_rest: bool = False,
 ) -> SceneTask:
-    """The task of a scene file, with the default model; warns about implausible numbers.
+    """The task of a scene file, with the default model.
 
     **Arguments:** `path`: the file; `inputs`: from the command line, None for those of the file;
     `precision`: of all numbers; `at_rest`: whether the inputs are zeros where there are none.
@@ -158,7 +158,6 @@ def read_task(
     """
     set_precision(precision)
     scene, stored, title = load(path)
-    warn(warnings_of(scene))
     values = stored if inputs is None else inputs
     if values is None:
         if scene.actuators and not at_rest:
@@ -196,8 +195,10 @@ def _solve(options: argparse.Namespace) -> int:
     check_folders(options.plot, options.json)
     eq = solve(scene, inputs, model=model, tolerance=options.tolerance)
     _tell(eq, title, options)
+    if not bool(eq.converged):
+        return NOT_CONVERGED
     warn(strain_warnings(eq))
-    return DONE if bool(eq.converged) else NOT_CONVERGED
+    return DONE
 
 
 def _check(options: argparse.Namespace) -> int:

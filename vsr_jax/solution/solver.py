@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from ..arm.plausible import warn
 from ..arm.scene import Scene
 from ..models.base import Model, Near, Outcome, Status, resolved
 from ..models.strain_dependent import StrainDependent
@@ -13,6 +14,7 @@ from ..numerics.compiling import program
 from ..typing import VectorLike, cast
 from ..validation import instance, is_traced, positive
 from .equilibrium import Equilibrium
+from .plausible_strain import strain_warnings
 from .step_choice import choose
 
 
@@ -67,6 +69,8 @@ def solve(
     model; for a start of a scene with other actuators. `SolveError` with `throw=True`; under
     `jax.jit`, the run-time error of equinox.
 
+    **Warns:** `UnitWarning` of inputs that would strain the arm far too much, if the solve fails.
+
     **Source:** eq. (8)-(21) of Renda et al. 2020.
     """
     instance("scene", scene, Scene, "a Scene")
@@ -75,6 +79,8 @@ def solve(
     scene, chosen = cast((scene, chosen), values.dtype)
     near = None if start is None else cast(near_of(scene, start), values.dtype)
     equilibrium = Equilibrium(scene, values, chosen, outcome_of(scene, values, chosen, near))
+    if not is_traced(equilibrium.status) and not bool(equilibrium.converged):
+        warn(strain_warnings(equilibrium))
     return _raise_if_failed(equilibrium) if throw else equilibrium
 
 
