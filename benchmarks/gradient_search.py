@@ -106,8 +106,17 @@ class Arm(NamedTuple):
     bending: float
 
 
-def drawn(made: Structure, random: np.random.Generator) -> check.Drawn:
-    """A random scene and its inputs, without zeros."""
+def material_of(name: str, young: Any, modulus: float, poisson: float, density: float) -> Any:
+    """A material by its name: for those of one modulus, the one at the base."""
+    if name == "neo-Hookean":
+        return vsr.NeoHookean(young, density)
+    if name == "Ogden":
+        return vsr.Ogden((modulus / 3.3, -modulus / 33), (2.0, -2.0), density)
+    return vsr.Material(young, poisson=poisson, density=density)
+
+
+def drawn(made: Structure, random: np.random.Generator, of: str = "linear") -> check.Drawn:
+    """A random scene and its inputs, without zeros, of a material by its name."""
     on, uniform = set(made.effects), random.uniform
     L = uniform(0.2, 0.4)
     base, young = L / uniform(24, 50), 10 ** uniform(5.3, 6.3)
@@ -120,7 +129,7 @@ def drawn(made: Structure, random: np.random.Generator) -> check.Drawn:
         else young
     )
     section = vsr.Circular(vsr.Taper(base, uniform(0.7, 1.0) * base))
-    material = vsr.Material(stiff, poisson=uniform(0.3, 0.49), density=density)
+    material = material_of(of, stiff, young, uniform(0.3, 0.49), density)
     pose = vsr.se3.exp(jnp.asarray([*uniform(-1, 1, 3), *uniform(-0.1, 0.1, 3)]))
     rod = vsr.Rod(L, section, material, rest_strain=rest, base=pose)
     arm = Arm(L, 0.7 * base, EI)
@@ -208,10 +217,12 @@ def loads(on: set[str], arm: Arm, density: float, random: np.random.Generator) -
     return loads
 
 
-def search(made: Structure, draws: int, model: Any = None) -> list[check.Found]:
+def search(
+    made: Structure, draws: int, model: Any = None, material: str = "linear"
+) -> list[check.Found]:
     """Derivatives of reproducible random scenes of a structure."""
     random = stream(made.effects)
-    scenes = [drawn(made, random) for _ in range(draws)]
+    scenes = [drawn(made, random, material) for _ in range(draws)]
     model = vsr.StrainDependent(STEPS) if model is None else model
     return check.compared(
         scenes,
@@ -220,16 +231,17 @@ def search(made: Structure, draws: int, model: Any = None) -> list[check.Found]:
     )
 
 
-def job(made: Structure, draws: int, *, basis: bool) -> check.Job:
+def job(made: Structure, draws: int, *, basis: bool, material: str = "linear") -> check.Job:
     """The search of a structure, in a prescribed `basis` too."""
 
     def found() -> list[check.Found]:
         family = vsr.Basis.uniform(vsr.Legendre(2), *(() if made.free is None else (made.free,)))
-        return search(made, draws, vsr.Prescribed(family, steps=STEPS) if basis else None)
+        model = vsr.Prescribed(family, steps=STEPS) if basis else None
+        return search(made, draws, model, material)
 
     name = (", ".join(made.effects) or "tendons alone") + " (Prescribed)" * basis
     model = "Prescribed" if basis else "StrainDependent"
-    return check.Job(name, {"model": model, **made._asdict()}, found)
+    return check.Job(name, {"model": model, "material": material, **made._asdict()}, found)
 
 
 def main() -> None:
@@ -241,10 +253,14 @@ def main() -> None:
         default=2,
         help="structures to solve also in a prescribed basis (default: %(default)s)",
     )
+    parser.add_argument("--material", choices=("linear", "neo-Hookean", "Ogden"), default="linear")
     options = parser.parse_args()
     chosen = structures(options.structures)
-    jobs = [job(made, options.draws, basis=False) for made in chosen]
-    jobs += [job(made, options.draws, basis=True) for made in chosen[: options.prescribed]]
+    of = options.material
+    jobs = [job(made, options.draws, basis=False, material=of) for made in chosen]
+    jobs += [
+        job(made, options.draws, basis=True, material=of) for made in chosen[: options.prescribed]
+    ]
     check.run(jobs, {"seed": SEED, "steps": STEPS}, options.json)
 
 

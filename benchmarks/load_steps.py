@@ -63,7 +63,7 @@ class Arm:
 
     def __init__(self, structure: Any, numbers: dict[str, Any], elements: int = ELEMENTS):
         n = {name: np.asarray(value) for name, value in numbers.items()}
-        self.count, self.h = elements, 1 / elements
+        self.count, self.h, self.rubber = elements, 1 / elements, structure.rubber
         self.middle = (np.arange(elements) + 0.5) * self.h
         L, base = n["length"], n["radius"]
         bending = n["young"] * np.pi * base**4 / 4
@@ -166,9 +166,8 @@ class Arm:
         ends, middle = self.poses(xi)
         A = _adjoint(middle)
         W, P, C, diagonal = self._carried(xi, ends, s)
-        r = self.stiffness * (xi - self.rest) - np.einsum("nji,nj->ni", A, W)
-        H = np.zeros((N, 6, 6))
-        H[:, range(6), range(6)] = self.stiffness
+        elastic, H = self._elastic(xi - self.rest)
+        r = elastic - np.einsum("nji,nj->ni", A, W)
         left, right = np.swapaxes(A, 1, 2), A
         below, above = (x.transpose(1, 0, 2).reshape(6, -1) for x in (right, -h * C @ right))
         J = np.where(
@@ -197,6 +196,27 @@ class Arm:
                 [[J, np.array(columns).T], [by_strain, np.diag(by_tension)]]
             )
         return r, J
+
+    def _elastic(self, strain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Wrench by the strain of each element and its derivative: linear, or of neo-Hookean
+        rubber, whose stiffness in twist and in bending is $c$ and $b$ times that at rest."""
+        S, H = self.stiffness, np.zeros((self.count, 6, 6))
+        if not self.rubber:
+            H[:, range(6), range(6)] = S
+            return S * strain, H
+        x = 1 + strain[:, 3]
+        c, dc, ddc = 1 / x, -1 / x**2, 2 / x**3
+        b, db, ddb = (x**-1 + 2 * x**-4) / 3, -(x**-2 + 8 * x**-5) / 3, (x**-3 + 20 * x**-6) / 1.5
+        one, zero = np.ones_like(x), np.zeros_like(x)
+        share = np.stack([c, b, b, one, one, one], 1)
+        by = np.stack([dc, db, db, zero, zero, zero], 1)
+        twice = np.stack([ddc, ddb, ddb, zero, zero, zero], 1)
+        wrench, energy = share * S * strain, 0.5 * S * strain**2
+        wrench[:, 3] = S[:, 3] * (x - x**-2) / 3 + np.sum(by * energy, 1)
+        H[:, range(6), range(6)] = share * S
+        H[:, 3, :] = H[:, :, 3] = by * S * strain
+        H[:, 3, 3] = S[:, 3] * (1 + 2 * x**-3) / 3 + np.sum(twice * energy, 1)
+        return wrench, H
 
     def _cable(
         self, i: int, T: float, s: float, share: np.ndarray, size: np.ndarray, B: np.ndarray

@@ -45,8 +45,8 @@ class Laid(NamedTuple):
 
 class Structure(NamedTuple):
     """Structure of a scene: tendons; gravity; wrenches by name, see `_loads`; the function that
-    draws its numbers; how its tip is held; whether there are obstacles that it cannot reach; and
-    whether its tendons run straight between `DISCS` even discs."""
+    draws its numbers; how its tip is held; whether there are obstacles that it cannot reach;
+    whether its tendons run straight between `DISCS` even discs; and whether it is of rubber."""
 
     tendons: tuple[Laid, ...] = ()
     gravity: bool = False
@@ -55,6 +55,7 @@ class Structure(NamedTuple):
     held: Literal["pinned", "clamped"] | None = None
     beside: bool = False
     discs: bool = False
+    rubber: bool = False
 
     def numbers(self, random: np.random.Generator) -> Numbers:
         """One draw."""
@@ -65,7 +66,11 @@ def built(structure: Structure, numbers: Numbers, share: Any = 1.0) -> tuple[vsr
     """Scene and inputs of a draw, with loads and inputs scaled by `share`."""
     n = {name: jnp.asarray(value) for name, value in numbers.items()}
     section = vsr.Circular(vsr.Taper(n["radius"], n["tip_radius"]))
-    material = vsr.Material(n["young"], poisson=n["poisson"], density=DENSITY)
+    material = (
+        vsr.NeoHookean(n["young"], DENSITY)
+        if structure.rubber
+        else vsr.Material(n["young"], poisson=n["poisson"], density=DENSITY)
+    )
     rest = (0.0, n["curvature"][0], n["curvature"][1], 1.0, 0.0, 0.0)
     discs = vsr.Discs(DISCS, radius=n["rim"])
     rod = vsr.Rod(n["length"], section, material, rest_strain=rest, discs=discs)
@@ -330,6 +335,17 @@ def antagonistic(structure: Structure, random: np.random.Generator) -> Numbers:
     )
 
 
+def stretched(structure: Structure, random: np.random.Generator) -> Numbers:
+    """Numbers of a thick arm of rubber whose tip is pulled by up to half of EA in any direction."""
+    numbers = ordinary(structure, random)
+    radius = numbers["length"] / random.uniform(6, 20)
+    taper = numbers["tip_radius"] / numbers["radius"]
+    size = {"radius": radius, "tip_radius": taper * radius, "poisson": 0.5}
+    axial = numbers["young"] * np.pi * (taper * radius) ** 2
+    force = 0.5 * random.random() ** 2 * axial * _direction(random)
+    return plain(numbers | size | {"tip world force": force})
+
+
 def _direction(random: np.random.Generator) -> np.ndarray:
     vector = random.normal(size=3)
     return vector / np.linalg.norm(vector)
@@ -368,6 +384,8 @@ STRUCTURES = {
     ),
     "antagonistic lengths": Structure((ELASTIC,) * 4, True, (), antagonistic),
     "antagonistic lengths, discs": Structure((ELASTIC,) * 3, True, (), antagonistic, discs=True),
+    "stretched rubber": Structure((), True, ("tip world",), stretched, rubber=True),
+    "rubber, tendons": Structure((TENSION, WOUND), True, ("spread world",), rubber=True),
     "beside obstacles": Structure((TENSION,) * 2, True, ("tip world",), beside=True),
     "limp ropes beside obstacles": Structure((), True, ("tip world",), limp, beside=True),
     "held, taut, pinned": Structure((), True, SPREAD, taut, "pinned"),

@@ -50,6 +50,8 @@ def test_other_scenes_add_one_effect_to_the_scene_that_they_name():
             assert one.scene.replace("obstacles[0].friction", 0.1).obstacles[0].friction == 0.1
     assert added == [
         ["sections", "straight tendons"],
+        ["rubber"],
+        ["inclusions"],
         ["sections", "rigid pieces"],
         ["held section"],
         ["cylinder"],
@@ -57,7 +59,7 @@ def test_other_scenes_add_one_effect_to_the_scene_that_they_name():
         [],
         [],
     ]
-    assert [one.followed for one in effects.single_scenes()] == [False] * 5 + [True] * 2
+    assert [one.followed for one in effects.single_scenes()] == [False] * 7 + [True] * 2
 
 
 def test_timed_measures_operations_and_times():

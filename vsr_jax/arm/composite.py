@@ -132,6 +132,7 @@ class Composite(Elasticity):
 
     material: Material
     inclusions: tuple[Inclusion, ...]
+    effect = "inclusions"
 
     def __init__(self, material: Material, inclusions: Sequence[Inclusion] | Inclusion):
         self.material = instance("Composite.material", material, Material, "a Material")

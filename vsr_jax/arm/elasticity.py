@@ -1,6 +1,7 @@
 """How the sections of an arm resist strain, and what they weigh: the interface of materials."""
 
 from abc import abstractmethod
+from typing import ClassVar
 
 from jaxtyping import Array
 
@@ -15,6 +16,9 @@ from .section_law import LinearLaw, SectionLaw
 class Elasticity(Part):
     """What a `Rod` is made of: a `Material`, which with the shape of the section gives its
     stiffness, or a `Stiffness` as it was measured. All methods take X and the arm's length [m]."""
+
+    effect: ClassVar[str | None] = None
+    """Its name in `Scene.effects`; None for what is linear and of one material."""
 
     @abstractmethod
     def stiffness(self, section: Section, X: ScalarLike, length: ScalarLike) -> Vector:

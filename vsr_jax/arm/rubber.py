@@ -103,6 +103,7 @@ class Rubber(Elasticity):
     """Incompressible material, $G = E / 3$, whose sections become smaller as the arm stretches."""
 
     density: eqx.AbstractVar[Profile | None]
+    effect = "rubber"
 
     @abstractmethod
     def modulus(self, X: ScalarLike, length: ScalarLike) -> Scalar:

@@ -181,6 +181,7 @@ class Scene(Part):
         names += [held.effect for held in self.held]
         names += [obstacle.effect for obstacle in self.obstacles]
         names += [option for effects in loads for option in effects[1:]]
+        names += [self.rod.material.effect] if self.rod.material.effect else []
         names += ["sections"] if self.breakpoints else []
         names += ["rigid pieces"] if self.rod.stiffened else []
         names += [option for effects in threads for option in effects[1:]]

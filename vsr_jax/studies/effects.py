@@ -12,6 +12,7 @@ from jaxtyping import Array, PyTree
 
 from ..analysis.following import follow
 from ..arm.actuator import Tendon
+from ..arm.composite import Composite, Inclusion
 from ..arm.discs import Discs
 from ..arm.held import Held
 from ..arm.loads import Gravity, PointWrench, TipWrench
@@ -23,6 +24,7 @@ from ..arm.profile import Piecewise
 from ..arm.rigid_piece import RigidPiece
 from ..arm.rod import Rod
 from ..arm.routing import Helix, Parallel
+from ..arm.rubber import NeoHookean
 from ..arm.scene import Scene
 from ..arm.section import Circular
 from ..models.base import Status
@@ -110,13 +112,16 @@ def added_scenes() -> list[EffectScene]:
 
 
 def single_scenes() -> list[EffectScene]:
-    """The arm under gravity with straight tendons, a rigid piece, a tip that slides along a line, a
-    pillar that it does not touch, or one on which it lies; the last one along a path, without and
-    with friction."""
+    """The arm under gravity with straight tendons, of rubber, with bores, with a rigid piece, a tip
+    that slides along a line, a pillar that it does not touch, or one on which it lies; the last one
+    along a path, without and with friction."""
     material = Material(8.0e5, poisson=0.45, density=1000.0)
     arm = Rod(0.3, Circular(0.01), material)
     tooled = Rod(0.3, Circular(0.01), material, rigid=[RigidPiece(0.25)])
     guided_by_discs = Rod(0.3, Circular(0.01), material, discs=Discs(8))
+    rubber = Rod(0.3, Circular(0.01), NeoHookean(8.0e5, density=1000.0))
+    bores = [Inclusion(Parallel(y, 0.0), 0.002) for y in (-0.006, 0.006)]
+    bored = Rod(0.3, Circular(0.01), Composite(material, bores))
     paths, gravity = (Helix(0.007, 1.5), Parallel(0.0, 0.007)), Gravity((0.0, 0.0, -9.81))
     tendons = [Tendon(path) for path in paths]
     straight = [Tendon(path, straight=True) for path in paths]
@@ -128,6 +133,8 @@ def single_scenes() -> list[EffectScene]:
         EffectScene(
             "straight tendons", Scene(guided_by_discs, straight, gravity), base="+ gravity"
         ),
+        EffectScene("rubber", Scene(rubber, tendons, gravity), base="+ gravity"),
+        EffectScene("bores", Scene(bored, tendons, gravity), base="+ gravity"),
         EffectScene("rigid piece", Scene(tooled, tendons, gravity), base="+ gravity"),
         EffectScene("held tip", Scene(arm, tendons, gravity, held=guided), base="+ gravity"),
         EffectScene(
