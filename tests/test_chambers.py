@@ -175,3 +175,30 @@ def test_bad_chambers_are_refused(make, message, unchecked):
     with pytest.raises(ValueError) as told:  # noqa: PT011
         make()
     assert str(told.value).startswith(message)
+
+
+@pytest.mark.slow
+def test_shapes_without_weight_tell_only_the_ratio_of_modulus_and_area():
+    """A public case: with chambers of 6.236e-5 m^2 in place of the 1.2828e-4 m^2 that were made,
+    the modulus comes out at 0.486 of the truth."""
+    angles = np.arange(3) * 2 * np.pi / 3
+    paths = [vsr.Parallel(0.02 * np.cos(t), 0.02 * np.sin(t)) for t in angles]
+    rod = vsr.Rod(0.2, vsr.Circular(0.03), vsr.Material(1.0766e6, poisson=0.5, density=1104.0))
+    scene = vsr.Scene(rod, [vsr.Chamber(path, 1.2828e-4) for path in paths])
+    pressures = np.array([[2e5, 0.0, 0.0], [1e5, 2e5, 0.0], [0.5e5, 1e5, 3e5]])
+    stations = np.array([0.1, 0.2])
+    model = vsr.StrainDependent(4)
+    shapes = [vsr.solve(scene, u, model=model).position(stations) for u in pressures]
+    data = vsr.Measurements(pressures, vsr.Markers(np.stack(shapes), stations, sd=1e-4))
+    unknown = {
+        "rod.material.young": (2e5, 5e6),
+        "actuators[*].area": vsr.Unknown(2e-5, 8e-4, shared=True),
+    }
+    assumed = scene.replace({"rod.material.young": 5e5, "actuators[*].area": 6.236e-5})
+    found = vsr.fit(assumed, unknown, data, model=model, progress=False)
+    numbers = {name: one.value for name, one in found.numbers.items()}
+    ratio = numbers["rod.material.young"] / numbers["actuators[*].area"]
+    np.testing.assert_allclose(6.236e-5 * ratio / 1.0766e6, 0.486, atol=2e-4)
+    (sentence,) = found.undetermined
+    assert "rod.material.young" in sentence
+    assert "actuators[*].area" in sentence

@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 import vsr_jax as vsr
-from vsr_jax.arm import SectionLaw
+from vsr_jax.arm import LinearLaw, SectionLaw
 from vsr_jax.typing import Scalar
 
 LENGTH, RADIUS, YOUNG = 0.3, 0.006, 1e6
@@ -62,6 +62,15 @@ def test_a_moment_that_follows_bends_an_arm_into_the_circle_of_its_law(model):
     )
     energy = LENGTH * BENDING * (k**2 / 2 + k**4 / (4 * 8.0**2))
     np.testing.assert_allclose(eq.energy.elastic, energy, rtol=1e-9)
+
+
+def test_the_linear_law_takes_six_products_and_nothing_for_its_tangent():
+    """What arms took before sections had a law."""
+    strain = stiffness = tuple(jnp.zeros(4) for _ in range(6))
+    wrench = jax.make_jaxpr(LinearLaw().wrench)(strain, stiffness)
+    assert [equation.primitive.name for equation in wrench.eqns] == ["mul"] * 6
+    tangent = jax.make_jaxpr(LinearLaw().tangent)(strain, stiffness)
+    assert {equation.primitive.name for equation in tangent.eqns} <= {"broadcast_in_dim"}
 
 
 def test_a_tendon_bends_it_by_less_than_a_linear_arm():
