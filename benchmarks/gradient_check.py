@@ -13,6 +13,7 @@ import argparse
 import json
 import os
 import time
+import warnings
 from collections.abc import Callable, Iterable
 from itertools import combinations
 from pathlib import Path
@@ -265,6 +266,7 @@ def run(jobs: Iterable[Job], record: dict[str, Any], path: str | None) -> None:
     # nothing is timed
     os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
     jax.config.update("jax_enable_x64", True)
+    warnings.simplefilter("ignore", vsr.UnitWarning)  # densities follow from weights that are drawn
     print(HEADER)
     rows: list[dict[str, Any]] = []
     for job in jobs:
