@@ -161,6 +161,25 @@ def test_the_neo_hookean_law_is_one_term_of_ogdens():
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9), *tangents)
 
 
+@pytest.mark.parametrize("rubber", [RUBBER, vsr.Ogden((4e5, 1e3, -1e4), (1.7, 5.0, -2.0))])
+def test_wrench_and_tangent_are_derivatives_of_the_energy(rubber):
+    section = vsr.Circular(RADIUS)
+    law, stiffness = rubber.law(section, 0.0, LENGTH), rubber.stiffness(section, 0.0, LENGTH)
+
+    def energy(x):
+        return law.energy(tuple(x), stiffness)
+
+    for stretched in (-0.4, 0.0, 0.7):
+        x = jnp.array([5.0, -3.0, 8.0, stretched, 0.1, -0.2])
+        np.testing.assert_allclose(
+            law.wrench(tuple(x), stiffness), jax.grad(energy)(x), rtol=1e-9, atol=1e-12
+        )
+        rows = law.tangent(tuple(x), stiffness)
+        lower = jnp.tril(jax.hessian(energy)(x))
+        for i, row in enumerate(rows):
+            np.testing.assert_allclose(jnp.stack(row), lower[i, : i + 1], rtol=1e-9, atol=1e-9)
+
+
 def test_an_inflated_bar_becomes_longer():
     """A tube with fibres around it: $p a = EA/3 (s - s^{-2})$ with the area $A$ of its wall."""
     wall = np.pi * (RADIUS**2 - 0.004**2)

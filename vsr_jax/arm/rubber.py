@@ -15,14 +15,16 @@ Soc. A 211 (1952).
 """
 
 from abc import abstractmethod
+from collections.abc import Callable
 from functools import reduce
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..numerics.component import Vector, add, scale
+from ..numerics.component import Matrix, Tree, Vector, add, dot, multiply, scale
 from ..typing import Scalar, ScalarLike, VectorLike
 from ..validation import concrete, numbers
 from .elasticity import Elasticity
@@ -42,19 +44,54 @@ class Uniaxial(NamedTuple):
 
 
 class RubberLaw(SectionLaw):
-    """The law of a section of rubber; a subclass says how it stretches."""
+    """The law of a section of rubber: a quadratic form of bending, twist and shear, whose factors
+    depend on the stretch. A subclass says how it stretches."""
 
     @abstractmethod
     def uniaxial(self, stretch: Array) -> Uniaxial:
         """Response to a stretch $\\lambda$ [-]."""
 
-    def energy(self, strain: Vector, stiffness: Vector) -> Array:
-        (kx, ky, kz, ux, uy, uz), (GJ, EJy, EJz, EA, GAy, GAz) = strain, stiffness
-        stretch = 1 + ux
+    def _factors(self, stretch: Array) -> Vector:
+        """What multiplies $\\frac12 \\Sigma_{ii} \\varepsilon_i^2$ of each strain, and $w$ in the place
+        of the stretch."""
         of = self.uniaxial(stretch)
-        bent = 0.5 * of.slope / stretch * (EJy * ky**2 + EJz * kz**2)
-        sheared = 1.5 * of.shear * (GJ * kx**2 / stretch + GAy * uy**2 + GAz * uz**2)
-        return EA * of.energy + bent + sheared
+        bent, sheared = of.slope / stretch, 3 * of.shear
+        return (sheared / stretch, bent, bent, of.energy, sheared, sheared)
+
+    def energy(self, strain: Vector, stiffness: Vector) -> Array:
+        factors = self._factors(1 + strain[3])
+        return dot(factors, _weights(strain, stiffness))
+
+    def wrench(self, strain: Vector, stiffness: Vector) -> Vector:
+        factors, slopes = _with_slopes(self._factors)(1 + strain[3])
+        found = list(multiply(factors, multiply(stiffness, strain)))
+        found[3] = dot(slopes, _weights(strain, stiffness))
+        return tuple(found)
+
+    def tangent(self, strain: Vector, stiffness: Vector) -> Matrix:
+        (factors, slopes), (_, curvatures) = _with_slopes(_with_slopes(self._factors))(
+            1 + strain[3]
+        )
+        diagonal = list(multiply(factors, stiffness))
+        diagonal[3] = dot(curvatures, _weights(strain, stiffness))
+        coupling = multiply(slopes, multiply(stiffness, strain))  # of each strain with the stretch
+        zero = jnp.zeros_like(strain[0])
+        rows = [[zero] * i + [diagonal[i]] for i in range(6)]
+        rows[3][:3] = coupling[:3]
+        rows[4][3], rows[5][3] = coupling[4:]
+        return tuple(map(tuple, rows))
+
+
+def _weights(strain: Vector, stiffness: Vector) -> Vector:
+    """$\\frac12 \\Sigma_{ii} \\varepsilon_i^2$, and $EA$ in the place of the stretch."""
+    weights = list(scale(0.5, multiply(stiffness, multiply(strain, strain))))
+    weights[3] = stiffness[3]
+    return tuple(weights)
+
+
+def _with_slopes(function: Callable[[Array], Tree]) -> Callable[[Array], tuple[Tree, Tree]]:
+    """Values and derivatives of a function of one number, section by section."""
+    return lambda x: jax.jvp(function, (x,), (jnp.ones_like(x),))
 
 
 class NeoHookeanLaw(RubberLaw):
