@@ -52,8 +52,8 @@ class RubberLaw(SectionLaw):
         """Response to a stretch $\\lambda$ [-]."""
 
     def _factors(self, stretch: Array) -> Vector:
-        """What multiplies $\\frac12 \\Sigma_{ii} \\varepsilon_i^2$ of each strain, and $w$ in the place
-        of the stretch."""
+        """What multiplies $\\frac12 \\Sigma_{ii} \\varepsilon_i^2$ of each strain, with $w$ in the
+        place of the stretch."""
         of = self.uniaxial(stretch)
         bent, sheared = of.slope / stretch, 3 * of.shear
         return (sheared / stretch, bent, bent, of.energy, sheared, sheared)
