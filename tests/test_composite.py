@@ -108,6 +108,42 @@ def test_a_bore_is_as_long_as_its_chamber():
         vsr.Inclusion.of(vsr.Tendon(AXIS))
 
 
+def test_a_lined_lumen_is_as_long_as_its_ends_say():
+    liner = vsr.Composite(STIFF, vsr.Inclusion(AXIS, 0.001))
+    lumen = vsr.Composite(SOFT, vsr.Inclusion(AXIS, 0.002, liner, start=0.1, end=0.2))
+    axial = [float(lumen.stiffness(CIRCLE, X, LENGTH)[3]) for X in (0.05, 0.15, 0.25)]
+    outside, wall = 1e6 * AREA, np.pi * (0.002**2 - 0.001**2)
+    lined = 1e6 * (AREA - np.pi * 0.002**2) + 5e7 * wall
+    np.testing.assert_allclose(axial, (outside, lined, outside), rtol=1e-12)
+    mass = [float(lumen.mass_per_length(CIRCLE, X, LENGTH)) for X in (0.05, 0.15)]
+    heavy = 1000 * (AREA - np.pi * 0.002**2) + 8000 * wall
+    np.testing.assert_allclose(mass, (1000 * AREA, heavy), rtol=1e-12)
+
+
+def test_chambers_that_follow_each_other_have_a_bore_each():
+    ends = {"end": 0.15}, {"start": 0.15}
+    chambers = [vsr.Chamber(vsr.Parallel(0.005, 0.0), 2e-5, **one) for one in ends]
+    bored = vsr.Composite(SOFT, [vsr.Inclusion.of(chamber) for chamber in chambers])
+    scene = vsr.Scene(vsr.Rod(LENGTH, CIRCLE, bored), chambers)
+    axial = [float(scene.rod.stiffness(X)[3]) for X in (0.1, 0.2)]
+    np.testing.assert_allclose(axial, 1e6 * AREA - 20.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize("torsion", ["saint_venant", "polar"])
+def test_bores_of_a_strip_leave_a_share_of_its_torsion(torsion):
+    """By the bores' share of the polar moment; factors of shear do not change it."""
+    bores = [vsr.Inclusion(vsr.Parallel(y, 0.0), 0.001) for y in (-0.018, 0.018)]
+    strip = vsr.Rectangular(0.04, 0.004, torsion=torsion, shear_correction=(0.8, 0.9))
+    shape, a = strip.geometry(0.1, LENGTH), np.pi * 0.001**2
+    polar = shape.moment_y + shape.moment_z
+    lost = 2 * (a * 0.001**2 / 2 + a * 0.018**2)
+    matrix = vsr.Composite(SOFT, bores).matrix(strip, 0.1, LENGTH)
+    GJ = 1e6 / 3 * float(shape.torsion) * (1 - lost / polar)
+    np.testing.assert_allclose(matrix[0, 0], GJ, rtol=1e-12)
+    np.testing.assert_allclose(matrix[4, 4], 0.8e6 / 3 * (shape.area - 2 * a), rtol=1e-12)
+    assert np.linalg.eigvalsh(matrix)[0] > 0
+
+
 @pytest.mark.slow
 def test_models_agree():
     wire = vsr.Inclusion(vsr.Helix(0.006, pitch=0.3), 0.001, STIFF)
@@ -157,14 +193,18 @@ def test_scene_files_keep_composites():
             [vsr.Inclusion(vsr.Parallel(0.0095, 0.0), 1e-3)],
             r"inclusions\[0\].radius: .* need a disc",
         ),
-        ([vsr.Inclusion(AXIS, 1e-3)] * 2, r"inclusions\[1\].radius: .* clear of others"),
+        ([vsr.Inclusion(AXIS, 1e-3)] * 2, r"inclusions\[1\].radius: .* clear of the other"),
         (
             [vsr.Inclusion(AXIS, 2e-3, vsr.Composite(STIFF, vsr.Inclusion(AXIS, 3e-3)))],
             r"inclusions\[0\].material.inclusions\[0\].radius: .* need a disc inside",
         ),
         (
             [vsr.Inclusion(AXIS, lambda X: 1e-3 - X)],
-            r"inclusions\[0\].radius: got -0.299 at X = 0.3 m, need a size > 0",
+            r"inclusions\[0\].radius: got -0.299 m at X = 0.3 m, need a size > 0",
+        ),
+        (
+            [vsr.Inclusion(AXIS, 1e-3, end=0.35)],
+            r"inclusions\[0\].end: got 0.35 m, need a place on the arm of 0.3 m",
         ),
     ],
 )
@@ -175,6 +215,14 @@ def test_inclusions_fit_into_the_section(inclusions, message):
 
 @pytest.mark.usefixtures("unchecked")
 def test_what_is_no_material_is_refused():
+    with pytest.raises(ValueError, match=r"Inclusion.of: got 3, need a Chamber"):
+        vsr.Inclusion.of(3)
+    with pytest.raises(ValueError, match=r"Inclusion.end: .* need an end beyond the start"):
+        vsr.Inclusion(AXIS, 1e-3, start=0.2, end=0.1)
+    tube = vsr.Annular(RADIUS, 0.004)
+    filled = vsr.Rod(LENGTH, tube, vsr.Composite(SOFT, vsr.Inclusion(AXIS, 0.005)))
+    with pytest.raises(ValueError, match="need a disc clear of the section's hole"):
+        vsr.Scene(filled)
     with pytest.raises(ValueError, match=r"Composite.material: .* need a Material"):
         vsr.Composite(vsr.NeoHookean(1e6), [])
     with pytest.raises(ValueError, match=r"Inclusion.material: .* a Material, a Composite or None"):

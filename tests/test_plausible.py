@@ -1,6 +1,7 @@
 """Warnings about implausible numbers: names, guessed units, none for ordinary arms."""
 
 import pathlib
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -13,10 +14,12 @@ from vsr_jax.files.scene_file import load
 from vsr_jax.optimization import design_search
 from vsr_jax.solution.plausible_strain import strain_warnings
 from vsr_jax.studies import paper
+from vsr_jax.viz import body
 
 FOLDER = pathlib.Path(__file__).parents[1] / "notebooks"
 SCENES = sorted((FOLDER / "scenes").glob("*.toml"))
 HELIX = (FOLDER / "scenes" / "helix.toml").read_text()
+STEEL = vsr.Material(2e11, poisson=0.3)
 PARALLEL = 'type = "Parallel", y = 0.0, z = 0.0'
 
 
@@ -116,6 +119,24 @@ def test_the_materials_of_a_composite_are_named():
     rod = vsr.Rod(0.3, vsr.Circular(0.01), vsr.Composite(vsr.Material(1e6, poisson=0.5), wire))
     (sentence,) = vsr.Scene(rod).warnings
     assert sentence.startswith("rod.material.inclusions[0].material.young: 200 Pa; materials")
+    odd = vsr.Composite(vsr.Material(2e6, shear=1.1e3), [])
+    (sentence,) = vsr.Scene(vsr.Rod(0.3, vsr.Circular(0.01), odd)).warnings
+    assert sentence.startswith("rod.material.material: young 2e+06 Pa and shear 1100 Pa;")
+    rubber = vsr.Ogden((0.4, -0.01), (2.0, -2.0))
+    (sentence,) = vsr.Scene(vsr.Rod(0.3, vsr.Circular(0.01), rubber)).warnings
+    assert "shear_moduli times exponents): 1.23 Pa" in sentence
+
+
+def test_code_without_a_module_may_make_scenes():
+    exec("import vsr_jax as vsr\nvsr.Scene(vsr.Rod(400.0, vsr.Circular(0.01), M))", {"M": STEEL})
+
+
+def test_numbers_that_the_package_tries_are_not_warned_of():
+    with pytest.warns(vsr.UnitWarning):
+        scene = arm(length=400.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        body.at_rest(vsr.solve(scene, [0.0], model=vsr.StrainDependent(2)))
 
 
 def test_stiffness_that_no_section_has_is_named():
@@ -198,6 +219,7 @@ def test_the_health_of_a_solve_has_the_warnings(helix):
     assert health.record()["warnings"] == [sentence]
 
 
+@pytest.mark.filterwarnings("always::vsr_jax.UnitWarning")
 @pytest.mark.parametrize(
     "arguments",
     [["solve"], ["check"], ["sweep"], ["reach", "--target", "0.1", "0", "0"]],
@@ -217,6 +239,7 @@ def test_commands_warn_on_stderr_before_solving(arguments, tmp_path, capsys):
     assert out == ""
 
 
+@pytest.mark.filterwarnings("always::vsr_jax.UnitWarning")
 def test_design_warns_on_stderr_before_solving(tmp_path, capsys, monkeypatch):
     def design(*_, **__):
         raise ValueError("not now")

@@ -133,18 +133,19 @@ def between(start: Scalar | None, end: Scalar | None, X: ScalarLike) -> Array | 
     return here if end is None else jnp.where(end > X, here, 0.0)
 
 
-def _checked(
-    actuator: str, routing: Routing, start: ScalarLike | None, end: ScalarLike | None
+def checked_path(
+    owner: str, routing: Routing, start: ScalarLike | None, end: ScalarLike | None
 ) -> tuple[Routing, Scalar | None, Scalar | None]:
+    """A path and its ends, checked."""
     needed = "a routing such as Parallel, Linear, Helix, Polynomial, Spline or Function"
-    path = instance(f"{actuator}.routing", routing, Routing, needed)
-    first = None if start is None else numbers(f"{actuator}.start", start, least=0.0)
-    last = None if end is None else numbers(f"{actuator}.end", end, positive=True)
+    path = instance(f"{owner}.routing", routing, Routing, needed)
+    first = None if start is None else numbers(f"{owner}.start", start, least=0.0)
+    last = None if end is None else numbers(f"{owner}.end", end, positive=True)
     if first is not None and last is not None:
         known = concrete(first), concrete(last)
         if known[0] is not None and known[1] is not None and not known[0] < known[1]:
             raise ValueError(
-                f"{actuator}.end: got end = {known[1]:g} m and start = {known[0]:g} m, need an "
+                f"{owner}.end: got end = {known[1]:g} m and start = {known[0]:g} m, need an "
                 f"end beyond the start"
             )
     return path, first, last
@@ -162,7 +163,7 @@ class Thread(Actuator):
     def __init__(
         self, routing: Routing, *, start: ScalarLike | None = None, end: ScalarLike | None = None
     ):
-        self.routing, self.start, self.end = _checked("Thread", routing, start, end)
+        self.routing, self.start, self.end = checked_path("Thread", routing, start, end)
 
     @property
     def unit(self) -> str:
@@ -237,7 +238,7 @@ class Tendon(Actuator):
         motion: Literal["pull", "release"] = "pull",
         straight: bool = False,
     ):
-        self.routing, self.start, self.end = _checked("Tendon", routing, start, end)
+        self.routing, self.start, self.end = checked_path("Tendon", routing, start, end)
         self.control = choice("Tendon.control", control, ("tension", "length"))
         of_lengths = {"stiffness": stiffness, "spool": spool, "offset": offset}
         for name, value in of_lengths.items():
@@ -370,7 +371,7 @@ class Chamber(Actuator):
         dead_volume: ScalarLike | None = None,
         atmosphere: ScalarLike | None = None,
     ):
-        self.routing, self.start, self.end = _checked("Chamber", routing, start, end)
+        self.routing, self.start, self.end = checked_path("Chamber", routing, start, end)
         self.area = numbers("Chamber.area", area, positive=True)
         self.control = choice("Chamber.control", control, ("pressure", "volume", "gas"))
         for name, value, needed in (

@@ -51,6 +51,11 @@ class Elasticity(Part):
         """Its numbers and their limits, in a section."""
 
     @property
+    def places(self) -> dict[str, Scalar]:
+        """Abscissas [m] by name that must be on the arm."""
+        return {}
+
+    @property
     @abstractmethod
     def breakpoints(self) -> tuple[Scalar, ...]:
         """Abscissas [m] where a property or one of its derivatives jumps."""

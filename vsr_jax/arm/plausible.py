@@ -6,7 +6,9 @@ No number is rejected here.
 
 import sys
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -20,7 +22,7 @@ from .rod import Rod
 
 
 class UnitWarning(UserWarning):
-    """A number far outside of what arms have, most often in a wrong unit. Off by
+    """A number far outside of what arms have, most often in a wrong unit. Turn it off with
     `warnings.filterwarnings("ignore", category=vsr.UnitWarning)`."""
 
 
@@ -28,10 +30,28 @@ _BETWEEN = ("vsr_jax", "equinox", "jaxtyping", "beartype")
 """Packages whose frames are between a warning and the user's line."""
 
 
-def warn(sentences: Iterable[str]) -> None:
+_QUIET = ContextVar("quiet", default=False)
+
+
+@contextmanager
+def quietly() -> Iterator[None]:
+    """Without warnings, where the package makes scenes of numbers that the user has not chosen or
+    has been warned of."""
+    before = _QUIET.set(True)
+    try:
+        yield
+    finally:
+        _QUIET.reset(before)
+
+
+def warn(sentences: Sequence[str]) -> None:
     """Warns of each, at the line of the user's that led here."""
+    if not sentences or _QUIET.get():
+        return
     frame, level = sys._getframe(), 1
-    while frame.f_back is not None and frame.f_globals["__name__"].split(".")[0] in _BETWEEN:
+    while frame.f_back is not None:
+        if frame.f_globals.get("__name__", "").split(".")[0] not in _BETWEEN:
+            break
         frame, level = frame.f_back, level + 1
     for sentence in sentences:
         warnings.warn(sentence, UnitWarning, stacklevel=level)
@@ -98,7 +118,11 @@ _RANGES = {
 }
 """Ranges of a rod's numbers, by name."""
 
-_OF_MATERIALS = {"young": _MODULUS, "shear": _MODULUS, "density": _DENSITY}
+_OF_MATERIALS = {
+    "young": _MODULUS,
+    "shear": _MODULUS,
+    "density": _DENSITY,
+}
 """Ranges of a material's numbers, by the last part of their names."""
 
 
@@ -132,7 +156,7 @@ def doubts(
         if name in values:
             yield from range_.doubts(name, values[name])
     for name, value in measures.material.items():
-        range_ = _OF_MATERIALS.get(name.rpartition(".")[2])
+        range_ = _OF_MATERIALS.get(name.rpartition(".")[2].split()[0])
         if range_ is not None:
             yield from range_.doubts(f"rod.material.{name}", value)
     slenderness = length / thickness
@@ -183,11 +207,11 @@ def _measured_stiffness(measures: Measures) -> Iterator[str]:
 
 def _moduli(material: Mapping[str, _AnyArray]) -> Iterator[str]:
     """Warns if the ratio of two moduli, each plausible by itself, is implausible."""
-    if "shear" not in material:
-        return
-    young, shear = (float(np.mean(material[name])) for name in ("young", "shear"))
-    if _MODULUS.contains(young) and _MODULUS.contains(shear) and not 0.01 <= young / shear <= 1000:
-        yield (
-            f"rod.material: young {young:.6g} Pa and shear {shear:.6g} Pa; "
-            "their ratio is 2 to 3 in most materials; are both in Pa?"
-        )
+    for owner in [name[: -len("shear")] for name in material if name.endswith("shear")]:
+        young, shear = (float(np.mean(material[owner + name])) for name in ("young", "shear"))
+        plausible = _MODULUS.contains(young) and _MODULUS.contains(shear)
+        if plausible and not 0.01 <= young / shear <= 1000:
+            yield (
+                f"rod.material{('.' + owner)[:-1]}: young {young:.6g} Pa and shear {shear:.6g} Pa; "
+                "their ratio is 2 to 3 in most materials; are both in Pa?"
+            )

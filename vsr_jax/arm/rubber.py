@@ -17,7 +17,7 @@ Soc. A 211 (1952).
 from abc import abstractmethod
 from collections.abc import Callable
 from functools import reduce
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -52,8 +52,8 @@ class RubberLaw(SectionLaw):
         """Response to a stretch $\\lambda$ [-]."""
 
     def _factors(self, stretch: Array) -> Vector:
-        """What multiplies $\\frac12 \\Sigma_{ii} \\varepsilon_i^2$ of each strain, with $w$ in the
-        place of the stretch."""
+        """Six factors of `_weights`: those of the stiffness in twist, bending and shear, and as the
+        fourth $w(\\lambda)$, which multiplies EA."""
         of = self.uniaxial(stretch)
         bent, sheared = of.slope / stretch, 3 * of.shear
         return (sheared / stretch, bent, bent, of.energy, sheared, sheared)
@@ -137,10 +137,12 @@ def _sinh_share(x: Array) -> Array:
 
 
 class Rubber(Elasticity):
-    """Incompressible material, $G = E / 3$, whose sections become smaller as the arm stretches."""
+    """Incompressible material, $G = E / 3$, whose sections become smaller as the arm stretches. Its
+    stretch counts from the rest strain."""
 
     density: eqx.AbstractVar[Profile | None]
     effect = "rubber"
+    _modulus_name: ClassVar[str] = "young"
 
     @abstractmethod
     def modulus(self, X: ScalarLike, length: ScalarLike) -> Scalar:
@@ -161,7 +163,7 @@ class Rubber(Elasticity):
 
     def limits(self, section: Section, X: ScalarLike, length: ScalarLike) -> Limits:
         young = self.modulus(X, length)
-        found = {("young", "a number > 0"): (young, young)}
+        found = {(self._modulus_name, "a number > 0"): (young, young)}
         if self.density is not None:
             density = self.density(X, length)
             found["density", "a number > 0"] = density, density
@@ -211,7 +213,9 @@ class Ogden(Rubber):
     fitted to tension tests. At rest $E = \frac32 \sum_i \mu_i \alpha_i$.
 
     A Mooney-Rivlin material of constants $C_1, C_2$ is `Ogden((2 * C1, -2 * C2), (2, -2))`, and
-    `NeoHookean` is one term of exponent 2, valid for the same strains.
+    `NeoHookean` is one term of exponent 2, valid for the same strains. The tension of a bar,
+    $A \sum_i \mu_i (\lambda^{\alpha_i - 1} - \lambda^{-\alpha_i / 2 - 1})$, has to rise with
+    $\lambda$: beyond its largest value there is no equilibrium.
 
     **Arguments:**
     - `shear_moduli`: $\mu_i$ [Pa], any number of them.
@@ -224,6 +228,7 @@ class Ogden(Rubber):
     shear_moduli: Float[Array, " terms"] = eqx.field(metadata={"unit": "Pa"})
     exponents: Float[Array, " terms"] = eqx.field(metadata={"unit": "-"})
     density: Profile | None = eqx.field(metadata={"unit": "kg/m^3"})
+    _modulus_name = "young (3/2 of the sum of shear_moduli times exponents)"
 
     def __init__(
         self, shear_moduli: VectorLike, exponents: VectorLike, density: ProfileLike | None = None
@@ -247,6 +252,13 @@ class Ogden(Rubber):
 
     def modulus(self, X: ScalarLike, length: ScalarLike) -> Scalar:
         return 1.5 * jnp.dot(self.shear_moduli, self.exponents)
+
+    def limits(self, section: Section, X: ScalarLike, length: ScalarLike) -> Limits:
+        least = jnp.min(jnp.abs(self.exponents))
+        return {
+            **super().limits(section, X, length),
+            ("exponents (the least in size)", "a number other than 0"): (least, least),
+        }
 
     def law(self, section: Section, X: ScalarLike, length: ScalarLike) -> SectionLaw:
         shares = self.shear_moduli / self.modulus(X, length)

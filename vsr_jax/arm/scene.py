@@ -407,14 +407,15 @@ class Scene(Part):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Sentences about implausible numbers, most often a wrong unit; none for traced numbers."""
-        if any(is_traced(leaf) for leaf in jax.tree.leaves(self)):
+        """Sentences about implausible numbers, most often a wrong unit; none for traced numbers and
+        for a batch."""
+        if jnp.ndim(self.rod.length) or any(map(is_traced, jax.tree.leaves(self))):
             return ()
         return check_numbers(self.rod, self.actuators, self.loads, self.edges)
 
     def _check_numbers(self) -> None:
-        if not any(is_traced(leaf) for leaf in jax.tree.leaves(self)):
-            warn(self.warnings)
+        if not any(map(is_traced, jax.tree.leaves(self))):
+            warn(check_numbers(self.rod, self.actuators, self.loads, self.edges))
             check_held(self.rod, self.held)
             check_obstacles(self.rod, self.obstacles, self.edges)
 

@@ -50,7 +50,8 @@ def check_numbers(
     X, limited, clearances, measures = jax.tree.map(np.asarray, probe)
     for (name, needed), (values, room) in limited.items():
         if not np.all(room > 0):
-            i, unit = int(np.argmin(room)), " m" if name.startswith("section") else ""
+            i, is_length = int(np.argmin(room)), name.startswith("section") or "radius" in name
+            unit = " m" if is_length else ""
             raise ValueError(
                 f"Scene.rod.{name}: got {values[i]:g}{unit} at X = {X[i]:g} m, need {needed} "
                 f"everywhere"
@@ -87,6 +88,12 @@ def _check_places(
                 )
         if actuator.straight:
             _check_straight(f"Scene.actuators[{i}]", actuator, rod)
+    for name, x in rod.material.places.items():
+        if float(x) > beyond:
+            raise ValueError(
+                f"Scene.rod.material.{name}: got {float(x):g} m, need a place on the arm of "
+                f"{length:g} m"
+            )
     if rod.discs is not None:
         _check_discs(rod.discs, length)
     for i, load in enumerate(loads):

@@ -129,7 +129,7 @@ class Stiffness(Elasticity):
         values = {name: profile(X, length) for name, profile in self._profiles.items()}
         found = {(name, "a number > 0"): (value, value) for name, value in values.items()}
         if self.matrix is not None:
-            least = _least_eigenvalue(self._matrix(X))
+            least = least_eigenvalue(self._matrix(X))
             found["matrix (its least eigenvalue, scaled)", "a number > 0"] = least, least
         return found
 
@@ -138,7 +138,7 @@ class Stiffness(Elasticity):
         return tuple(x for profile in self._profiles.values() for x in profile.breakpoints)
 
 
-def _least_eigenvalue(matrix: Array) -> Array:
+def least_eigenvalue(matrix: Array) -> Array:
     """The least eigenvalue of a matrix whose diagonal is scaled to 1: units do not matter."""
     size = jnp.sqrt(jnp.abs(jnp.diagonal(matrix)))
     return jnp.linalg.eigvalsh(matrix / (size[:, None] * size))[0]

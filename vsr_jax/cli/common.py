@@ -57,7 +57,7 @@ def check_folders(*paths: str | None) -> None:
             raise ValueError(f"{path}: there is no folder {str(Path(path).parent)!r}")
 
 
-def warn(sentences: Iterable[str]) -> None:
+def print_warnings(sentences: Iterable[str]) -> None:
     """Prints warnings to stderr, one per line."""
     for sentence in sentences:
         print(f"vsr-jax: warning: {sentence}", file=sys.stderr)

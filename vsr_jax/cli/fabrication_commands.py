@@ -11,8 +11,8 @@ from .common import (
     Commands,
     check_folders,
     command,
+    print_warnings,
     set_precision,
-    warn,
 )
 from .scene_commands import add_scene, task_of
 
@@ -95,7 +95,7 @@ def _export(options: argparse.Namespace) -> int:
         if not bool(arm.converged):
             print("\n".join((title or options.scene, *arm.heading)))
             return NOT_CONVERGED
-        warn(strain_warnings(arm))
+        print_warnings(strain_warnings(arm))
     made = fabrication_of(
         arm,
         bore=options.bore[0] if options.bore and len(options.bore) == 1 else options.bore,
@@ -105,5 +105,5 @@ def _export(options: argparse.Namespace) -> int:
     )
     made.write(**files)
     print(title or options.scene, made, sep="\n")
-    warn(made.warnings)
+    print_warnings(made.warnings)
     return DONE

@@ -17,7 +17,7 @@ from .common import (
     bounds,
     check_folders,
     command,
-    warn,
+    print_warnings,
 )
 from .scene_commands import add_scene, model_between, task_of
 
@@ -72,7 +72,7 @@ def _reach(options: argparse.Namespace) -> int:
     eq = found.equilibrium
     print("\n".join(report.lines(eq, report.values(eq), task.title or options.scene)))
     print(textwrap.indent(str(found), "  "))
-    warn(strain_warnings(eq))
+    print_warnings(strain_warnings(eq))
     if options.json:
         outcome = {
             "target": options.target,

@@ -5,12 +5,12 @@ import argparse
 import os
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from .. import __version__
-from .common import BAD_USAGE, EXIT_CODES, warn
+from .common import BAD_USAGE, EXIT_CODES, print_warnings
 
 
 class Command(NamedTuple):
@@ -95,13 +95,26 @@ def main(argv: Sequence[str] | None = None) -> int:
     if getattr(options, "no_cache", False):
         os.environ["VSR_JAX_CACHE"] = "off"
     with warnings.catch_warnings():
-        warnings.simplefilter("always", UserWarning)
-        warnings.showwarning = lambda message, *_: warn([str(message)])
+        warnings.showwarning = _shown(warnings.showwarning)
         try:
             return options.run(options)
         except (ValueError, OSError, ImportError) as error:
             print(f"vsr-jax: {' '.join(str(error).split())}", file=sys.stderr)
             return BAD_USAGE
+
+
+def _shown(otherwise: Callable[..., None]) -> Callable[..., None]:
+    """Prints a warning of units as the commands do, each once, and another one `otherwise`."""
+    said = set()
+
+    def show(message: Warning, category: type[Warning], *where: Any) -> None:
+        if category.__name__ != "UnitWarning":  # whose module imports JAX
+            otherwise(message, category, *where)
+        elif str(message) not in said:
+            said.add(str(message))
+            print_warnings([str(message)])
+
+    return show
 
 
 def _spaced(argument: str) -> str:

@@ -31,8 +31,8 @@ from .common import (
     command,
     draw_without_display,
     positive_integer,
+    print_warnings,
     set_precision,
-    warn,
 )
 
 MODELS = ("strain-dependent", "prescribed", "continuum")
@@ -197,7 +197,7 @@ def _solve(options: argparse.Namespace) -> int:
     _tell(eq, title, options)
     if not bool(eq.converged):
         return NOT_CONVERGED
-    warn(strain_warnings(eq))
+    print_warnings(strain_warnings(eq))
     return DONE
 
 
@@ -211,7 +211,6 @@ def _check(options: argparse.Namespace) -> int:
     )
     health = check(scene, inputs, model=model)
     print(title or options.scene, health, sep="\n")
-    warn(strain_warnings(health.equilibrium))
     if options.json:
         write_json(options.json, {"scene": options.scene, "title": title, **health.record()})
     return DONE if bool(health.equilibrium.converged) else NOT_CONVERGED

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..arm.plausible import quietly
 from ..arm.scene import Scene
 from ..numerics.compiling import program
 from ..numerics.component import norm
@@ -202,7 +203,8 @@ def _solved(arm: Scene | Equilibrium) -> Equilibrium:
     if any(concrete(leaf) is None for leaf in jax.tree.leaves(eqx.filter(arm, eqx.is_array))):
         raise ValueError("arm: got traced numbers, need known ones: call export outside of jax.jit")
     if isinstance(arm, Scene):
-        eq = solve(Scene(arm.rod), jnp.zeros(0, arm.rod.length.dtype))
+        with quietly():
+            eq = solve(Scene(arm.rod), jnp.zeros(0, arm.rod.length.dtype))
     else:
         eq = arm
     eq.refuse_batch()

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..analysis.inverse import Reach, reach
+from ..arm.plausible import quietly
 from ..arm.scene import Scene
 from ..arm.scene_numbers import parameters
 from ..files.scene_file import to_toml
@@ -108,7 +109,8 @@ class Session:
 
     def scene_of(self, setting: Setting) -> Scene:
         """The scene of a setting. Errors as for `current`."""
-        return self.scene.replace(setting.numbers) if setting.numbers else self.scene
+        with quietly():
+            return self.scene.replace(setting.numbers) if setting.numbers else self.scene
 
     @property
     def input_ranges(self) -> list[tuple[float, float]]:

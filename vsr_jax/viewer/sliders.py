@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..arm.actuator import Actuator, Chamber
+from ..arm.plausible import quietly
 from ..arm.scene import Scene
 from ..arm.scene_numbers import Parameter, matching, parameters
 from ..optimization.problem import INPUTS
@@ -249,7 +250,8 @@ def _allowed(
         changed = array.copy()
         changed[place] = number
         try:
-            scene.replace(of, changed)
+            with quietly():
+                scene.replace(of, changed)
         except ValueError:
             return False
         return True

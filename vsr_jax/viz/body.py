@@ -14,6 +14,7 @@ from matplotlib.typing import ColorType
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 from mpl_toolkits.mplot3d.axes3d import Axes3D
 
+from ..arm.plausible import quietly
 from ..arm.scene import Scene
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import solve
@@ -135,7 +136,8 @@ def body_from_samples(eq: Equilibrium, samples: Summary) -> Body:
 
 def at_rest(eq: Equilibrium) -> Equilibrium:
     """The arm without loads and inputs."""
-    scene = Scene(eq.scene.rod, eq.scene.actuators, free_strains=eq.scene.free_strains)
+    with quietly():
+        scene = Scene(eq.scene.rod, eq.scene.actuators, free_strains=eq.scene.free_strains)
     return solve(scene, jnp.zeros_like(eq.inputs), model=eq.model)
 
 
