@@ -8,6 +8,7 @@ import pathlib
 import re
 import subprocess
 import sys
+import warnings
 from typing import NamedTuple
 
 import numpy as np
@@ -36,7 +37,12 @@ class Run(NamedTuple):
 
 def solve_helix(folder, tau) -> Run:
     out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+    with (
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+        warnings.catch_warnings(),
+    ):
+        warnings.simplefilter("always", vsr_jax.UnitWarning)
         code = cli.main(
             [
                 "solve",
