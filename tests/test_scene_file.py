@@ -105,6 +105,21 @@ def full_scene() -> vsr.Scene:
 
 OTHER_MATERIALS = (
     vsr.NeoHookean(vsr.Taper(1e6, 2e6 / 3), density=1e3 / 7),
+    vsr.Ogden((1e6 / 3, -1e4 / 7), (2.0, -2 / 3), density=1e3 / 7),
+    vsr.Composite(
+        vsr.Material(1e6 / 3, poisson=1 / 3),
+        [
+            vsr.Inclusion(vsr.Parallel(1e-3 / 3, 0.0), vsr.Taper(1e-3, 2e-3 / 3), end=0.1 / 3),
+            vsr.Inclusion(
+                vsr.Parallel(-6e-3, 0.0),
+                2e-3 / 3,
+                vsr.Composite(
+                    vsr.Material(2e7 / 3, shear=1e7 / 7),
+                    vsr.Inclusion(vsr.Parallel(-6e-3, 0.0), 1e-3 / 3),
+                ),
+            ),
+        ],
+    ),
     vsr.Stiffness(1 / 3, vsr.Taper(1.0, 2 / 3), EA=1e3 / 7, mass=1 / 7),
     vsr.Stiffness(matrix=np.diag([1 / 3, 0.1, 0.2, 1e3 / 7, 30.0, 40.0])),
 )
