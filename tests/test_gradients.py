@@ -253,15 +253,15 @@ def test_what_the_search_takes_for_wrong():
 
 
 @pytest.mark.slow
-def test_six_drawn_scenes_have_the_right_gradient_or_none():
+def test_a_dozen_drawn_scenes_have_the_right_gradient_or_none():
     from benchmarks.gradient_check import verdict
     from benchmarks.gradient_search import search, structures
 
-    made = next(
+    chosen = [
         made
         for made in structures(12)
         if len(made.effects) in (4, 5) and (made.pull or made.release)
-    )
-    said = [verdict(found) for found in search(made, 6)]
+    ][:2]
+    said = [verdict(found) for made in chosen for found in search(made, 6)]
     assert not [words for words in said if words.startswith("wrong")], said
-    assert said.count("agrees") >= 4, said
+    assert said.count("agrees") >= 8, said

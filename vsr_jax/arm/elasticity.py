@@ -3,12 +3,13 @@
 from abc import abstractmethod
 from typing import ClassVar
 
+import equinox as eqx
 from jaxtyping import Array
 
 from ..numerics.component import Vector
 from ..typing import Scalar, ScalarLike
 from .description import Part
-from .profile import Limits
+from .profile import Limits, Profile
 from .section import Section
 from .section_law import LinearLaw, SectionLaw
 
@@ -59,3 +60,17 @@ class Elasticity(Part):
     @abstractmethod
     def breakpoints(self) -> tuple[Scalar, ...]:
         """Abscissas [m] where a property or one of its derivatives jumps."""
+
+
+class Solid(Elasticity):
+    """A material that fills its sections, whose mass follows from its density."""
+
+    density: eqx.AbstractVar[Profile | None]
+
+    @property
+    def weighs(self) -> bool:
+        return self.density is not None
+
+    def mass_per_length(self, section: Section, X: ScalarLike, length: ScalarLike) -> Array:
+        assert self.density is not None  # see `weighs`
+        return self.density(X, length) * section.geometry(X, length).area

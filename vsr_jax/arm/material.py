@@ -3,11 +3,10 @@ J_z, E A, \kappa_y G A, \kappa_z G A)$."""
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array
 
 from ..numerics.component import Vector
 from ..typing import Scalar, ScalarLike
-from .elasticity import Elasticity
+from .elasticity import Solid
 from .profile import Limits, Profile, ProfileLike, as_profile
 from .section import Geometry, Section
 
@@ -15,7 +14,7 @@ LEAST_POISSON, MOST_POISSON = -1.0, 0.5
 """Range of Poisson's ratio of a stable isotropic material; the lower bound is excluded."""
 
 
-class Material(Elasticity):
+class Material(Solid):
     """Linear elastic material, uniform or varying along the arm.
 
     **Arguments**, each a profile (a number, a `Profile` or a function of X):
@@ -78,14 +77,6 @@ class Material(Elasticity):
         """Diagonal of $\\Sigma(X)$, six scalars [N m^2] and [N]."""
         shape = section.geometry(X, length)
         return isotropic_stiffness(shape, self.young(X, length), self.shear_modulus(X, length))
-
-    @property
-    def weighs(self) -> bool:
-        return self.density is not None
-
-    def mass_per_length(self, section: Section, X: ScalarLike, length: ScalarLike) -> Array:
-        assert self.density is not None  # see `weighs`
-        return self.density(X, length) * section.geometry(X, length).area
 
     def moduli(self, X: ScalarLike, length: ScalarLike) -> tuple[Scalar, Scalar] | None:
         return self.young(X, length), self.shear_modulus(X, length)

@@ -27,7 +27,7 @@ from jaxtyping import Array, Float
 from ..numerics.component import Matrix, Tree, Vector, add, dot, multiply, scale
 from ..typing import Scalar, ScalarLike, VectorLike
 from ..validation import concrete, numbers
-from .elasticity import Elasticity
+from .elasticity import Solid
 from .material import isotropic_stiffness
 from .profile import Limits, Profile, ProfileLike, as_profile
 from .section import Section
@@ -136,11 +136,10 @@ def _sinh_share(x: Array) -> Array:
     return jnp.where(small, series, jnp.sinh(apart) / apart)
 
 
-class Rubber(Elasticity):
+class Rubber(Solid):
     """Incompressible material, $G = E / 3$, whose sections become smaller as the arm stretches. Its
     stretch counts from the rest strain."""
 
-    density: eqx.AbstractVar[Profile | None]
     effect = "rubber"
     _modulus_name: ClassVar[str] = "young"
 
@@ -152,14 +151,6 @@ class Rubber(Elasticity):
         """Diagonal of $\\Sigma(X)$ at rest, six scalars [N m^2] and [N]."""
         young = self.modulus(X, length)
         return isotropic_stiffness(section.geometry(X, length), young, young / 3)
-
-    @property
-    def weighs(self) -> bool:
-        return self.density is not None
-
-    def mass_per_length(self, section: Section, X: ScalarLike, length: ScalarLike) -> Array:
-        assert self.density is not None  # see `weighs`
-        return self.density(X, length) * section.geometry(X, length).area
 
     def limits(self, section: Section, X: ScalarLike, length: ScalarLike) -> Limits:
         young = self.modulus(X, length)
