@@ -147,7 +147,8 @@ class _System(NamedTuple):
 
     def problem(self, s: Array) -> tuple[ArmProblem, tuple[int, ...]]:
         """The balance at s, and its free strains."""
-        scene, inputs = _at(self.scene, self.path, s)
+        given, inputs = _at(self.scene, self.path, s)
+        scene = given.at(inputs)
         return problem_of(scene, inputs, self.model.grid(scene)), scene.free
 
     def unknown(self, u: Array, problem: ArmProblem, free: tuple[int, ...]) -> ArmUnknown:
@@ -325,7 +326,7 @@ def _equilibrium(system: _System, u: Array, status: Array, steps: Array) -> Equi
     unknown = system.unknown(jnp.append(y, s), problem, free)
     forces = forces_at(problem.couplings, unknown.coupled, problem.forces)
     state = ArmSolution(*unknown, problem.couplings)
-    outcome = resolved(system.model, scene, Outcome(state, forces, status, steps))
+    outcome = resolved(system.model, scene.at(inputs), Outcome(state, forces, status, steps))
     found = outcome.status == Status.CONVERGED
     status = jnp.where(found, status_of_inputs(scene, inputs), outcome.status)
     outcome = outcome._replace(status=status)

@@ -105,7 +105,7 @@ def sensitivity(eq: Equilibrium) -> Sensitivity:
     """
     known = parameters(eq.scene)
     named = [entry for name, parameter in known.items() for entry in parameter.entries(name)]
-    named += [(f"inputs[{i}]", actuator.unit) for i, actuator in enumerate(eq.scene.actuators)]
+    named += [(f"inputs[{i}]", one.unit) for i, one in enumerate(eq.given_scene.inputs)]
     values, turn, place = _by_numbers(eq)
     return Sensitivity(
         tuple(name for name, _ in named), tuple(unit for _, unit in named), values, turn, place
@@ -116,11 +116,14 @@ def sensitivity(eq: Equilibrium) -> Sensitivity:
 def _by_numbers(eq: Equilibrium) -> tuple[Array, Array, Array]:
     numbers = {name: parameter.value for name, parameter in parameters(eq.scene).items()}
 
-    def motion(numbers: dict[str, Array], inputs: Array) -> Array:
-        scene = replaced(eq.scene, numbers)
-        return _motion(_moved(eq, scene, inputs).tip, eq.tip)
+    def motion(changes: dict[str, Array], inputs: Array) -> Array:
+        scene = eq.given_scene.at(inputs)
+        known = parameters(scene)
+        new = {name: known[name].value + change for name, change in changes.items()}
+        return _motion(_moved(eq, replaced(scene, new), inputs).tip, eq.tip)
 
-    by_numbers, by_inputs = jax.jacrev(motion, argnums=(0, 1))(numbers, eq.inputs)
+    none = jax.tree.map(jnp.zeros_like, numbers)
+    by_numbers, by_inputs = jax.jacrev(motion, argnums=(0, 1))(none, eq.inputs)
     rows = jnp.concatenate(
         [*(by_numbers[name].reshape(6, -1) for name in numbers), by_inputs], axis=1
     ).T
@@ -148,7 +151,7 @@ def tip_jacobian(eq: Equilibrium) -> Float[Array, "6 inputs"]:
 @program("tip_jacobian")
 def _by_inputs(eq: Equilibrium) -> Array:
     def motion(inputs: Array) -> Array:
-        return _motion(_moved(eq, eq.scene, inputs).tip, eq.tip)
+        return _motion(_moved(eq, eq.given_scene.at(inputs), inputs).tip, eq.tip)
 
     return eq.masked(jax.jacfwd(motion)(eq.inputs))
 
@@ -238,8 +241,8 @@ def manipulability(eq: Equilibrium, scale: VectorLike = 1.0) -> Ellipsoid:
     Its `measure` is Yoshikawa's, $\sqrt{\det J J^T}$ of the scaled J, 0 for fewer than three
     inputs.
 
-    **Arguments:** `eq`: a solved scene; `scale`: $s$, one number or one per actuator, in the units
-    of the inputs.
+    **Arguments:** `eq`: a solved scene; `scale`: $s$, one number or one per input, in the
+    units of the inputs.
 
     **Source:** T. Yoshikawa, Manipulability of Robotic Mechanisms, Int. J. Robotics Research 4
     (1985).

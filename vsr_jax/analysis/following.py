@@ -66,12 +66,12 @@ def follow(
 
     A path may also move the base, held sections, loads or any other number of the scene: `scene` is
     then that of every sample, as `jax.vmap(scene_of)(t)` makes it from a function of one parameter
-    and its values in order.
+    and its values in order. Numbers that are `driven` are part of the inputs.
 
     **Arguments:**
     - `scene`: one scene for the whole path, or one with a leading axis of samples in all its
       numbers. Obstacles with friction must not move: slip is that over the world.
-    - `inputs`: shape (samples, actuators), in order. Their dtype is the precision.
+    - `inputs`: shape (samples, inputs), in order. Their dtype is the precision.
     - `model`: a `StrainDependent`, the default.
     - `start`: where the path begins: an equilibrium of the same scene and model, for example the
       last one of another path, which the two then continue; by default the arm at rest, with all
@@ -93,10 +93,17 @@ def follow(
         raise ValueError(
             f"model: got {model}, need a StrainDependent, the only model with a memory"
         )
-    values = _path(scene, inputs)
-    scene = cast(scene, values.dtype)
     first = jax.tree.map(lambda x: x[0], scene) if _several(scene) else scene
-    before = model.at_rest(first, values.dtype) if start is None else _start(start, scene, model)
+    values = _path(scene, first, inputs)
+    scene, first = cast((scene, first), values.dtype)
+    if scene.driven:
+        known = jnp.isfinite(values[0])
+        first = first.at(jnp.where(known, values[0], first.rest_inputs))
+    before = model.at_rest(first, values.dtype) if start is None else _start(start, first, model)
+    if _moving(scene) and jax.tree.structure(before.scene) != jax.tree.structure(first):
+        raise ValueError(
+            "start: got an equilibrium of a scene with other parts, need those of the path's scenes"
+        )
     before = cast(before, values.dtype)
     outcomes = _follow(scene, before, values)
     known = not any(map(is_traced, jax.tree.leaves((scene, before, outcomes.status))))
@@ -116,7 +123,8 @@ def _completed(scene: Scene, before: Near, inputs: Array, found: Outcome) -> Out
         if solved[i]:
             continue
         last = np.flatnonzero(solved[:i])
-        near, first = before, jnp.zeros_like(inputs[0])
+        # at rest the actuators exert nothing, and what is driven is where the path begins
+        near, first = before, inputs[0].at[: len(scene.actuators)].set(0.0)
         if last.size:
             near, first = _at(before, found, int(last[-1])), inputs[last[-1]]
         for parts in (parts for parts in _SMALLER if parts <= number):
@@ -162,12 +170,16 @@ def _several(scene: Scene) -> bool:
     return jnp.ndim(scene.rod.length) > 0
 
 
-def _path(scene: Scene, inputs: ArrayLike) -> Array:
-    values = numbers("inputs", inputs, None, finite=False)
-    if values.ndim != 2 or values.shape[1] != len(scene.actuators) or not len(values):
+def _moving(scene: Scene) -> bool:
+    """Whether the numbers of the scene change along the path."""
+    return _several(scene) or bool(scene.driven)
+
+
+def _path(scene: Scene, first: Scene, inputs: ArrayLike) -> Array:
+    values, size = numbers("inputs", inputs, None, finite=False), len(first.inputs)
+    if values.ndim != 2 or values.shape[1] != size or not len(values):
         raise ValueError(
-            f"inputs: got shape {values.shape}, need (samples, {len(scene.actuators)}), one row "
-            f"per sample"
+            f"inputs: got shape {values.shape}, need (samples, {size}), one row per sample"
         )
     if _several(scene) and scene.rod.length.shape != values.shape[:1]:
         raise ValueError(
@@ -181,12 +193,6 @@ def _start(start: Equilibrium, scene: Scene, model: Model) -> Near:
     near = near_of(scene, start)
     if near.model != model:
         raise ValueError(f"start: got an equilibrium by {near.model}, need one by {model}")
-    if not _several(scene):
-        return near._replace(scene=scene)
-    if jax.tree.structure(near.scene) != jax.tree.structure(scene):
-        raise ValueError(
-            "start: got an equilibrium of a scene with other parts, need those of the path's scenes"
-        )
     return near
 
 
@@ -197,17 +203,16 @@ def _follow(scene: Scene, before: Near, inputs: Array) -> Outcome:
     def proceed(carry: tuple, sample: tuple) -> tuple[tuple, Outcome]:
         last, *solution = carry
         values, own = sample
-        near = Near(model, scene if last is None else last, *solution)
+        here = scene if own is None else own
+        near = Near(model, here if last is None else last, *solution)
         outcome = checked_outcome(
-            scene if own is None else own,
-            values,
-            model,
-            lambda scene, u: model.solve_after(scene, u, near),
+            here, values, model, lambda there, u: model.solve_after(there, u, near)
         )
         found = outcome.status == Status.CONVERGED
-        after = (own, outcome.forces, outcome.state)
+        there = here.at(values) if moving else None
+        after = (there, outcome.forces, outcome.state)
         return jax.tree.map(lambda a, b: jnp.where(found, a, b), after, carry), outcome
 
-    several = _several(scene)
-    start = (before.scene if several else None, before.forces, model.remembered(before).state)
-    return scan(proceed, start, (inputs, scene if several else None))[1]
+    moving = _moving(scene)
+    start = (before.scene if moving else None, before.forces, model.remembered(before).state)
+    return scan(proceed, start, (inputs, scene if _several(scene) else None))[1]

@@ -214,17 +214,20 @@ def check(scene: Scene, inputs: ArrayLike, *, model: Model | None = None) -> Hea
 
 @program("check")
 def _check(eq: Equilibrium) -> Health:
-    scene, inputs, model = eq.scene, eq.inputs, eq.model
+    scene, inputs, model = eq.given_scene, eq.inputs, eq.model
+    rest = scene.rest_inputs if scene.driven else 0.0
     finer = solve(scene, inputs, model=model.finer())
 
     def status_at(of_inputs: Scalar, of_loads: Scalar) -> Array:
         loads = tuple(load.scaled(of_loads) for load in scene.loads)
         return solve(
-            eqx.tree_at(lambda scene: scene.loads, scene, loads), of_inputs * inputs, model=model
+            eqx.tree_at(lambda scene: scene.loads, scene, loads),
+            rest + of_inputs * (inputs - rest),
+            model=model,
         ).status
 
     # one program for both searches, since compiling takes longer than solving
-    grown = [True] * bool(scene.actuators) + [False] * bool(scene.loads)
+    grown = [True] * bool(scene.inputs) + [False] * bool(scene.loads)
     limits = (
         jax.vmap(
             lambda grow: _limit(lambda factor: status_at(*_either(grow, factor)), inputs.dtype)
@@ -236,7 +239,7 @@ def _check(eq: Equilibrium) -> Health:
     return Health(
         eq,
         _independence(scene) if len(scene.actuators) > 1 else None,
-        first if scene.actuators else None,
+        first if scene.inputs else None,
         last if scene.loads else None,
         norm(split(finer.tip[:3, 3] - eq.tip[:3, 3])),
     )

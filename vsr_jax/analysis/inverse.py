@@ -4,10 +4,10 @@ $\min_s \sum_j |x_j(s) - x_j^*|^2 / L^2 + v^2 \sum_k \max(0, \epsilon - g_k(s))^
 + w^2 \sum_i (s_i - s_{0i})^2, \quad u = u_0 + (u_1 - u_0) s, \quad 0 \le s_i \le 1$
 
 for a weight w that decreases to zero (`bounded_least_squares`), with the margins $g_k \ge 0$ of
-constraints. $s_0$ is the share at which an
-input is closest to zero, so the second sum selects the least effort among many solutions. The first
-start is the nearest of 512 random inputs; further starts follow if it does not reach the target.
-From a result for a target near by $s_0$ and the only start are its inputs.
+constraints. $s_0$ is the share at which an input is closest to its rest: zero for an actuator, the
+scene's own value for a driven number. So the second sum selects the least effort among many
+solutions. The first start is the nearest of 512 random inputs; further starts follow if it does not
+reach the target. From a result for a target near by $s_0$ and the only start are its inputs.
 Derivatives are those of the optimality condition.
 """
 
@@ -46,7 +46,7 @@ to the same minimum."""
 class Reach(NamedTuple):
     """Result of `reach`; `print` it for a summary.
 
-    - `inputs`: one number per actuator.
+    - `inputs`: as for `solve`.
     - `equilibrium`: the arm for these inputs.
     - `miss` [m]: distance from the target; for several points the root of the sum of squares, for a
       pose with the angle [rad] times the arm's length.
@@ -115,8 +115,7 @@ def reach(
     **Arguments:**
     - `target`: position of the tip [m], shape (3,); its pose, a rigid transform of shape (4, 4); or
       with `X` the positions of points on the axis, shape (points, 3). Its dtype is the precision.
-    - `bounds`: least and greatest inputs, a pair of numbers or of arrays with one number per
-      actuator.
+    - `bounds`: least and greatest inputs, a pair of numbers or of arrays with one number per input.
     - `X`: abscissas [m] of the points on the arm, shape (points,).
     - `constraints`: what must hold besides, of `vsr_jax.constraint`, for example
       `Clearance(0.002, obstacles)`.
@@ -175,9 +174,9 @@ class _ReachProblem(NamedTuple):
 
     @property
     def idle(self) -> Array:
-        """Share at which each input is closest to zero, or to that of the start."""
+        """Share at which each input is closest to its rest, or to that of the start."""
         span = jnp.where(self.high > self.low, self.high - self.low, 1.0)
-        rest = jnp.zeros_like(self.low) if self.start is None else self.start.inputs
+        rest = self.scene.rest_inputs if self.start is None else self.start.inputs
         return (jnp.clip(rest, self.low, self.high) - self.low) / span
 
     def at(self, share: Array) -> Equilibrium:
@@ -237,7 +236,7 @@ def _check_target(target: Array, X: Array | None, scene: Scene) -> None:
 def _check_bounds(
     scene: Scene, bounds: Sequence[ArrayLike], dtype: DTypeLike
 ) -> tuple[Array, Array]:
-    size = len(scene.actuators)
+    size = len(scene.inputs)
     if not size:
         raise ValueError("scene: got no actuators, need at least one")
     low, high = interval("bounds", bounds, size)

@@ -84,6 +84,7 @@ def labels(
     named = () if callable(task.outputs) else task.outputs
     coordinates = (
         _actuators(scene)
+        | _inputs(scene)
         | _axes(named)
         | (_dofs(model, like["q"].shape[1]) if "q" in named else {})
     )
@@ -111,15 +112,24 @@ def _given(task: Task, sample: PyTree) -> tuple[Scene, VectorLike]:
 
 
 def _actuators(scene: Scene) -> dict[str, _Coordinate]:
-    kinds, units = [type(a).__name__ for a in scene.actuators], [a.unit for a in scene.actuators]
+    kinds = [type(a).__name__ for a in scene.actuators]
     return {
         "actuator": _Coordinate(
             "actuator", "place in scene.actuators", np.arange(len(scene.actuators))
         ),
         "actuator_type": _Coordinate("actuator", "class of the actuator", np.array(kinds, str)),
-        "input_units": _Coordinate(
-            "actuator", "unit of the actuator's input", np.array(units, str)
-        ),
+    }
+
+
+def _inputs(scene: Scene) -> dict[str, _Coordinate]:
+    """Units of the inputs; with driven numbers their names too, on an axis of their own."""
+    names, units = ([getattr(x, of) for x in scene.inputs] for of in ("name", "unit"))
+    if not scene.driven:
+        unit = "unit of the actuator's input"
+        return {"input_units": _Coordinate("actuator", unit, np.array(units, str))}
+    return {
+        "input": _Coordinate("input", "class of an actuator, or number", np.array(names, str)),
+        "input_units": _Coordinate("input", "unit of the input", np.array(units, str)),
     }
 
 
@@ -142,10 +152,12 @@ def _sample(
         return _labelled(_numbered(name, x.ndim), {"long_name": f"samples, {name}"}, coordinates)
     units = sorted(set(coordinates["input_units"].values.tolist()))
     attributes = {
-        "long_name": "inputs of the actuators",
+        "long_name": "inputs of actuators and numbers"
+        if "input" in coordinates
+        else "inputs of the actuators",
         "units": units[0] if len(units) == 1 else "see input_units",
     }
-    return _labelled(("sample", "actuator"), attributes, coordinates)
+    return _labelled(("sample", coordinates["input_units"].dim), attributes, coordinates)
 
 
 def _output(name: str, x: Any, named: bool, coordinates: Mapping[str, _Coordinate]) -> Label:

@@ -214,10 +214,10 @@ def _samples(scene: Scene | Callable, inputs: PyTree) -> PyTree:
     )
     if isinstance(scene, Scene):
         samples = np.asarray(samples)
-        if samples.ndim != 2 or samples.shape[1] != len(scene.actuators):
+        if samples.ndim != 2 or samples.shape[1] != len(scene.inputs):
             raise ValueError(
                 f"sweep.inputs: got shape {samples.shape}, need (samples, "
-                f"{len(scene.actuators)}), one row per sample"
+                f"{len(scene.inputs)}), one row per sample"
             )
         if not np.issubdtype(samples.dtype, np.floating):
             samples = samples.astype(jax.dtypes.canonicalize_dtype(float))

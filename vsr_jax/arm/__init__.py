@@ -7,6 +7,7 @@ Data and their geometry only. Must not know how an equilibrium is found or how a
 from .actuator import Actuator, Chamber, Tendon, Thread, ThreadState
 from .composite import Composite, Inclusion
 from .discs import Discs
+from .driven import Input, InputRange
 from .elasticity import Elasticity
 from .held import Held, Support
 from .loads import DistributedWrench, Frame, Gravity, Load, PointWrench, TipWrench
@@ -65,6 +66,8 @@ __all__ = [
     "Held",
     "Helix",
     "Inclusion",
+    "Input",
+    "InputRange",
     "Joined",
     "Linear",
     "LinearLaw",

@@ -4,7 +4,8 @@
 
 - `unit`: see `Unit`, or `OF_OWNER`;
 - `powers`: True if item i is the coefficient of $X^i$, in `unit` per m^i;
-- `named`: False if the number has the name of the argument that holds it, as in `Constant`.
+- `named`: False if the number has the name of the argument that holds it, as in `Constant`;
+- `pose`: True for a pose (4, 4) or a rotation (3, 3).
 """
 
 import dataclasses

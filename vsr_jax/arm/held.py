@@ -80,7 +80,7 @@ class Held(Support):
 
     X: Scalar | None = eqx.field(metadata={"unit": "m"})
     position: Float[Array, "3"] | None = eqx.field(metadata={"unit": "m"})
-    orientation: Float[Array, "3 3"] | None
+    orientation: Float[Array, "3 3"] | None = eqx.field(metadata={"pose": True})
     along: Float[Array, "3"] | None
     effect = "held section"
 

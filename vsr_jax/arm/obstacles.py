@@ -175,7 +175,7 @@ class Cylinder(Obstacle):
 
     radius: Scalar = eqx.field(metadata={"unit": "m"})
     length: Scalar | None = eqx.field(metadata={"unit": "m"})
-    pose: Pose | None = eqx.field(metadata={"unit": "-"})
+    pose: Pose | None = eqx.field(metadata={"unit": "-", "pose": True})
     effect = "cylinder"
 
     def __init__(
@@ -214,7 +214,7 @@ class Box(Obstacle):
     """
 
     size: Float[Array, "3"] = eqx.field(metadata={"unit": "m"})
-    pose: Pose | None = eqx.field(metadata={"unit": "-"})
+    pose: Pose | None = eqx.field(metadata={"unit": "-", "pose": True})
     rounding: Scalar = eqx.field(metadata={"unit": "m"})
     effect = "box"
 

@@ -57,7 +57,7 @@ class Rod(Part):
     section: Section
     material: Elasticity
     rest_strain: ProfileVector = eqx.field(metadata={"unit": _STRAIN_UNITS})
-    base: Pose | None = eqx.field(metadata={"unit": "-"})
+    base: Pose | None = eqx.field(metadata={"unit": "-", "pose": True})
     discs: Discs | None
     rigid: tuple[RigidPiece, ...]
 

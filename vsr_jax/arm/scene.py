@@ -17,10 +17,11 @@ from ..typing import ArrayLike, DTypeLike, Scalar, ScalarLike, VectorLike, cast,
 from ..validation import concrete, instance, instances, is_traced, numbers, precise
 from .actuator import Actuator
 from .description import Part, describe, described_arguments, table
+from .driven import Input, InputRange, driven_by, rest_of, with_driven
 from .held import Support
 from .loads import Frame, Load
 from .obstacles import Obstacle
-from .plausible import warn
+from .plausible import quietly, warn
 from .pose_loads import PoseLoad
 from .rod import STRAINS, Rod
 from .routing import Path
@@ -97,6 +98,7 @@ class Scene(Part):
       `Stiffness` without a number. `("bending_y", "bending_z")` is an inextensible rod without
       twist and shear.
     - `obstacles`: `Plane`, `Sphere`, `Cylinder`, `Box`, `Tube` and `Field`, rigid and fixed.
+    - `driven`: numbers of the scene that are inputs too, after those of the actuators, `Input`.
 
     **Raises:** `ValueError` if
 
@@ -108,7 +110,8 @@ class Scene(Part):
     - a straight tendon has no discs, or does not start and end in discs,
     - there is gravity, and the material has no density or the stiffness no mass,
     - an obstacle has no size, a tube is narrower than the arm, or the arm starts inside an obstacle
-      or outside a tube.
+      or outside a tube,
+    - a driven number does not exist, or two inputs drive it.
 
     **Warns:** `UnitWarning` of numbers far outside of what arms have, such as `length=400`.
 
@@ -121,6 +124,7 @@ class Scene(Part):
     held: tuple[Support, ...]
     free_strains: tuple[str, ...] = eqx.field(static=True)
     obstacles: tuple[Obstacle, ...]
+    driven: tuple[Input, ...]
 
     def __init__(
         self,
@@ -131,6 +135,7 @@ class Scene(Part):
         held: Sequence[Support] | Support = (),
         free_strains: Sequence[str] = STRAINS,
         obstacles: Sequence[Obstacle] | Obstacle = (),
+        driven: Sequence[Input] | Input = (),
     ):
         self.rod = instance("Scene.rod", rod, Rod, "a Rod")
         self.actuators = instances(
@@ -155,6 +160,11 @@ class Scene(Part):
         self.obstacles = instances(
             "Scene.obstacles", obstacles, Obstacle, "a Plane, Sphere, Tube or other obstacle"
         )
+        self.driven = instances("Scene.driven", driven, Input, "an Input")
+        if rod.base is None and any(x.startswith("rod.base") for i in self.driven for x in i.names):
+            still = jnp.eye(4, dtype=rod.length.dtype)
+            self.rod = eqx.tree_at(lambda r: r.base, rod, still, is_leaf=lambda x: x is None)
+        driven_by(self, self.driven)
         for load in self.loads:
             load.check(rod)
         self._check_numbers()
@@ -162,7 +172,7 @@ class Scene(Part):
     def __repr__(self) -> str:
         rod = described_arguments(self.rod) if isinstance(self.rod, Part) else []
         rows = [(f"rod.{name}", text) for name, text in rod] or [("rod", describe(self.rod))]
-        for name in ("actuators", "loads", "held", "obstacles"):
+        for name in ("actuators", "loads", "held", "obstacles", "driven"):
             parts = getattr(self, name)
             if isinstance(parts, tuple):
                 rows += [(f"{name}[{i}]", _line(part)) for i, part in enumerate(parts)]
@@ -282,10 +292,8 @@ class Scene(Part):
 
     def forces(self, inputs: VectorLike) -> Forces:
         r"""Signed thread forces $\tau$ [N] for the inputs, one scalar per thread."""
-        return tuple(
-            actuator.force(value)
-            for actuator, value in zip(self.actuators, real(inputs), strict=True)
-        )
+        values = real(inputs)
+        return tuple(actuator.force(values[i]) for i, actuator in enumerate(self.actuators))
 
     def density(self, X: ArrayLike, frame: Frame) -> Wrench | None:
         """Sum $(c, f)$ of the loads per length of a frame at abscissas X of any shape; None
@@ -317,23 +325,52 @@ class Scene(Part):
         """Whether some load depends on the positions of the sections."""
         return any(load.needs == "pose" for load in self.pose_loads)
 
+    @property
+    def inputs(self) -> tuple[InputRange, ...]:
+        """What each input is: those of the actuators, then the driven numbers."""
+        threads = (InputRange(type(a).__name__, a.unit, a.lowest) for a in self.actuators)
+        return (*threads, *(one.range for one in driven_by(self, self.driven)))
+
+    @property
+    def rest_inputs(self) -> Float[Array, " inputs"]:
+        """Inputs without effort: zeros of the actuators, and driven numbers as the scene has
+        them."""
+        dtype = self.rod.length.dtype
+        idle = jnp.zeros(len(self.actuators), dtype)
+        if not self.driven:
+            return idle
+        rest = rest_of(self, driven_by(self, self.driven))
+        return jnp.concatenate([idle, jnp.stack(rest).astype(dtype)])
+
+    def at(self, inputs: VectorLike) -> "Scene":
+        """The scene with its driven numbers at some inputs, without `driven`; itself if it has
+        none."""
+        if not self.driven:
+            return self
+        values = real(inputs)[len(self.actuators) :]
+        moved = with_driven(self, driven_by(self, self.driven), list(values))
+        return eqx.tree_at(lambda scene: scene.driven, moved, ())
+
     def admits(self, inputs: VectorLike) -> Bool[Array, ""]:
-        """Whether every input is finite and in its actuator's range."""
+        """Whether every input is finite and in its range."""
         inputs = real(inputs)
-        lowest = np.array([actuator.lowest for actuator in self.actuators], inputs.dtype)
-        return jnp.all(jnp.isfinite(inputs) & (inputs >= lowest))
+        low, high = (np.array([getattr(x, end) for x in self.inputs]) for end in ("low", "high"))
+        within = jnp.isfinite(inputs) & (inputs >= low.astype(inputs.dtype))
+        if np.any(high < np.inf):
+            within &= inputs <= high.astype(inputs.dtype)
+        return jnp.all(within)
 
     def check_inputs(self, inputs: VectorLike) -> Float[Array, " inputs"]:
-        """`inputs` as an array, one number per actuator.
+        """`inputs` as an array, one number per actuator and driven number.
 
         **Raises:** `ValueError` for a wrong number of inputs and, if their values are known, for
-        NaN, infinities and values outside an actuator's range.
+        NaN, infinities, values outside their range, and driven numbers that no scene may have.
         """
-        array = numbers("inputs", inputs, None, finite=False)
-        if array.shape != (len(self.actuators),):
-            kinds = ", ".join(type(actuator).__name__ for actuator in self.actuators)
+        array, known_inputs = numbers("inputs", inputs, None, finite=False), self.inputs
+        if array.shape != (len(known_inputs),):
+            kinds = ", ".join(one.name for one in known_inputs)
             needed = (
-                f"({len(self.actuators)},), one number each for {kinds}"
+                f"({len(known_inputs)},), one number each for {kinds}"
                 if kinds
                 else "(0,), an empty list: the scene has no actuators"
             )
@@ -343,17 +380,17 @@ class Scene(Part):
         known = concrete(array)
         if known is None:
             return array
-        for i, (actuator, value) in enumerate(zip(self.actuators, known, strict=True)):
-            if not (np.isfinite(value) and value >= actuator.lowest):
-                needed = (
-                    "a finite number"
-                    if np.isinf(actuator.lowest)
-                    else f"a finite number >= {actuator.lowest:g}"
-                )
+        for i, (one, value) in enumerate(zip(known_inputs, known, strict=True)):
+            if not (np.isfinite(value) and one.low <= value <= one.high):
+                low = "" if np.isinf(one.low) else f" >= {one.low:g}"
+                high = "" if np.isinf(one.high) else f" <= {one.high:g}"
+                needed = f"a finite number{low}{' and' * bool(low and high)}{high}"
                 raise ValueError(
-                    f"inputs[{i}]: got {value:g}, need {needed} [{actuator.unit}] for a "
-                    f"{type(actuator).__name__}"
+                    f"inputs[{i}]: got {value:g}, need {needed} [{one.unit}] for a {one.name}"
                 )
+        if self.driven:
+            with quietly():
+                self.at(array)._check_numbers()
         for i in self.length_driven:
             length = concrete(self.rest_length(i))
             change = concrete(self.actuators[i].free_length(0.0, known[i]))

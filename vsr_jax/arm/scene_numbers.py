@@ -14,6 +14,7 @@ from operator import attrgetter, itemgetter
 from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -31,13 +32,15 @@ class Parameter(NamedTuple):
     """A number, or an array of numbers, of a scene.
 
     **Fields:** the `value`; its `unit`, "" where it is not known; `powers`, whether item i is the
-    coefficient of $X^i$ and has that unit per m^i; `way`, the steps from the scene to the value.
+    coefficient of $X^i$ and has that unit per m^i; `way`, the steps from the scene to the value;
+    `pose`, whether it is a pose or a rotation.
     """
 
     value: Array
     unit: str
     powers: bool
     way: Way
+    pose: bool = False
 
     def entries(self, name: str) -> list[tuple[str, str]]:
         """Name and unit of each of its numbers, in order."""
@@ -104,10 +107,10 @@ def _at(value: Any, way: Way) -> Any:
 
 
 def _walk(
-    value: Any, name: str, unit: Unit, powers: bool, way: Way
+    value: Any, name: str, unit: Unit, powers: bool, way: Way, pose: bool = False
 ) -> Iterator[tuple[str, Parameter]]:
-    if eqx.is_inexact_array(value):
-        yield name, Parameter(value, item_unit(unit, 0), powers, way)
+    if eqx.is_inexact_array(value) or isinstance(value, jax.ShapeDtypeStruct):
+        yield name, Parameter(value, item_unit(unit, 0), powers, way, pose)
     elif isinstance(value, eqx.Module):
         for field in dataclasses.fields(value):
             below = f"{name}.{field.name}" if name else field.name
@@ -117,6 +120,7 @@ def _walk(
                 unit_of(field, unit),
                 field.metadata.get("powers", False),
                 (*way, attrgetter(field.name)),
+                field.metadata.get("pose", False),
             )
     elif isinstance(value, tuple | list | dict):
         items = value.items() if isinstance(value, dict) else enumerate(value)

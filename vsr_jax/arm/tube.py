@@ -49,7 +49,7 @@ class Tube(Obstacle):
 
     radius: Profile = eqx.field(metadata={"unit": "m"})
     line: Float[Array, "points 3"] | None = eqx.field(metadata={"unit": "m"})
-    pose: Pose | None = eqx.field(metadata={"unit": "-"})
+    pose: Pose | None = eqx.field(metadata={"unit": "-", "pose": True})
     effect = "tube"
     encloses = lies_along = True
 

@@ -10,7 +10,7 @@ inputs_scale = 1.0         # factor to the units of the actuators, one number or
 series = "series"          # a column; optional
 
 [[observations]]           # arguments of the class, with columns in place of the measured values
-type = "Markers"           # or Curvatures, Tensions
+type = "Markers"           # or Curvatures, Tensions, Reactions, ContactForces
 columns = ["p1_x", "p1_y", "p1_z", "p2_x", "p2_y", "p2_z"]    # all of a row together
 scale = 0.001              # factor to SI units
 X = [0.1, 0.2]
@@ -36,8 +36,9 @@ from ..arm.scene import Scene
 from ..files.scene_file import at, check_keys, construct, kind_of, load, parse_table
 from ..typing import PathLike
 from ..validation import instance
+from .force_observations import ContactForces, Reactions, Tensions
 from .measurements import Measurements
-from .observation import Curvatures, Markers, Observation, Tensions
+from .observation import Curvatures, Markers, Observation
 from .unknowns import Free, Unknown
 
 _KEYS = ("title", "scene", "data", "observations", "free", "fit")
@@ -47,6 +48,8 @@ _KINDS: dict[str, tuple[type, str, int]] = {
     "Markers": (Markers, "position", 3),
     "Curvatures": (Curvatures, "curvature", 2),
     "Tensions": (Tensions, "tension", 1),
+    "Reactions": (Reactions, "force", 3),
+    "ContactForces": (ContactForces, "force", 3),
 }
 """Class, name of the argument with the measured values, and columns per row."""
 

@@ -1,4 +1,4 @@
-"""What is measured of a shape: positions of markers, poses, curvatures, tensions.
+"""What is measured of a shape: positions of markers, poses, curvatures.
 
 Another kind of measurement is a class with the fields `value`, `sd` and `name` and one method:
 
@@ -83,7 +83,7 @@ class Observation(eqx.Module):
         """
 
 
-def _values(name: str, value: ArrayLike, *ends: tuple[int, ...]) -> Array:
+def values(name: str, value: ArrayLike, *ends: tuple[int, ...]) -> Array:
     """`value` of shape (shapes, rows, *end) for one of the `ends`; a missing axis of rows is
     added."""
     array = numbers(name, value, None, finite=False)
@@ -166,7 +166,7 @@ class Markers(Observation):
         name: str = "markers",
         labelled: bool = True,
     ):
-        value = _values(f"{name}.position", position, (3,))
+        value = values(f"{name}.position", position, (3,))
         rows = value.shape[1]
         self.X = _stations(f"{name}.X", X, rows)
         shift = numbers(f"{name}.offset", offset, None)
@@ -234,7 +234,7 @@ class Poses(Observation):
         labels: Sequence[str] | None = None,
         name: str = "poses",
     ):
-        self.value = _values(f"{name}.pose", pose, (4, 4))
+        self.value = values(f"{name}.pose", pose, (4, 4))
         rows = self.value.shape[1]
         self.X = _stations(f"{name}.X", X, rows)
         if (sd is None) != (sd_angle is None):
@@ -312,7 +312,7 @@ class Curvatures(Observation):
         labels: Sequence[str] | None = None,
         name: str = "curvatures",
     ):
-        self.value = _values(f"{name}.curvature", curvature, (2,))
+        self.value = values(f"{name}.curvature", curvature, (2,))
         stations = _stations(f"{name}.X", X, self.value.shape[1])
         assert stations is not None
         self.X, self.sd = stations, deviation(f"{name}.sd", sd)
@@ -331,50 +331,3 @@ class Curvatures(Observation):
 
     def check(self, rod: Rod) -> None:
         on_arm(f"{self.name}.X", self.X, rod.length)
-
-
-class Tensions(Observation):
-    """Tensions of threads at their start, as from load cells: minus `eq.forces`.
-
-    **Arguments:**
-    - `tension`: measured tensions [N], shape (shapes, threads), or (shapes,) for one.
-    - `actuators`: index of the actuator of each, from 0.
-    - `sd` [N], `name`: as for `Markers`.
-
-    **Raises:** `ValueError` for wrong shapes and an `sd` that is not positive.
-    """
-
-    value: Float[Array, "shapes threads 1"]
-    sd: Float[Array, "..."] | None
-    actuators: tuple[int, ...] = eqx.field(static=True)
-    name: str = eqx.field(static=True)
-
-    def __init__(
-        self,
-        tension: ArrayLike,
-        actuators: Sequence[int] | int,
-        *,
-        sd: ArrayLike | None = None,
-        name: str = "tensions",
-    ):
-        self.value = _values(f"{name}.tension", tension, ())[..., None]
-        self.actuators = (actuators,) if isinstance(actuators, int) else tuple(actuators)
-        if len(self.actuators) != self.value.shape[1]:
-            raise ValueError(
-                f"{name}.actuators: got {len(self.actuators)}, need {self.value.shape[1]}, one for "
-                f"each column of tensions"
-            )
-        sizes = deviation(f"{name}.sd", sd)
-        self.sd = sizes if sizes is None or sizes.ndim == 0 else sizes[..., None]
-        self.name = name
-
-    def predicted(self, eq: Equilibrium) -> Float[Array, "threads 1"]:
-        return -eq.forces[jnp.array(self.actuators)][:, None]
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        return tuple(f"{self.name}[{i}]" for i in self.actuators)
-
-    @property
-    def units(self) -> tuple[str, ...]:
-        return ("N",) * len(self.actuators)

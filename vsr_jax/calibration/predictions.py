@@ -64,11 +64,11 @@ class Predictor(eqx.Module):
         return scene, observations
 
     def inputs(self, numbers: Float[Array, " slots"], recorded: Array) -> Array:
-        """The inputs of a shape, at least the lowest that its actuators admit."""
+        """The inputs of a shape, at least the lowest that the scene admits."""
         changed = self._entries(INPUTS, recorded, numbers)
         if changed is None:
             return recorded
-        lowest = jnp.array([one.lowest for one in self.scene.actuators], recorded.dtype)
+        lowest = jnp.array([one.low for one in self.scene.inputs], recorded.dtype)
         return jnp.where(changed > lowest, changed, lowest)
 
     def residual(
@@ -82,7 +82,7 @@ class Predictor(eqx.Module):
         from that of numbers near by."""
         scene, observations = self.set_up(numbers)
         inputs = self.inputs(numbers, recorded)
-        near = Near(self.model, self.scene, guess.forces, guess.state)
+        near = Near(self.model, self.scene.at(inputs), guess.forces, guess.state)
         outcome = outcome_of(scene, inputs, self.model, near)
         eq = Equilibrium(scene, inputs, self.model, outcome)
         parts = [

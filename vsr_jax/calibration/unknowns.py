@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..arm.driven import check_free
 from ..arm.scene import Scene
 from ..arm.scene_numbers import matching, parameters
 from ..typing import ArrayLike
@@ -101,6 +102,8 @@ def columns_of(scene: Scene, data: Measurements, free: Free) -> tuple[Column, ..
         groups = [(pattern, names)] if unknown.shared else [(name, [name]) for name in names]
         for label, members in groups:
             columns += _entries(label, unknown, [targets[name] for name in members])
+    acted = (slot for column in columns for slot, kind, _ in column.acts if kind == "all")
+    check_free(scene, scene.driven, acted)
     if not any(column.high > column.low for column in columns):
         raise ValueError("free: got equal bounds everywhere, need at least one number to find")
     return tuple(columns)
@@ -139,7 +142,7 @@ def _targets(scene: Scene, data: Measurements) -> Iterator[tuple[str, _Target]]:
         for name, unit in ((POSITION, "m"), (ROTATION, "rad")):
             label = f"{name}[{group}]" if group else name
             yield label, _Target(np.zeros(3), [unit] * 3, name, "series", group)
-    units = [actuator.unit for actuator in scene.actuators]
+    units = [one.unit for one in scene.inputs]
     if units:
         yield GAIN, _Target(np.ones(len(units)), ["-"] * len(units), INPUTS, "gain")
         yield OFFSET, _Target(np.zeros(len(units)), units, INPUTS, "offset")

@@ -5,8 +5,12 @@ import argparse
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from ..arm.scene import Scene
 
 DONE, NOT_CONVERGED, BAD_USAGE = 0, 1, 2
 """Exit codes."""
@@ -111,22 +115,34 @@ def set_precision(precision: str) -> None:
 
 
 def bounds(
-    low: Sequence[float] | None, high: Sequence[float] | None, default: np.ndarray
+    low: Sequence[float] | None,
+    high: Sequence[float] | None,
+    scene: "Scene",
+    inputs: np.ndarray,
+    factor: float = 1.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Least and greatest inputs, one number per actuator, from `--low` and `--high`; by default the
-    range from 0 to `default`, which may be negative.
+    """Least and greatest inputs, one number per input, from `--low` and `--high`; by default those
+    of a driven number with both bounds, and for others the range from rest to `factor` times as far
+    as `inputs`.
 
     **Raises:** `ValueError` for a wrong number of values, and if a lower bound exceeds its upper
     bound.
     """
+    rest = np.asarray(scene.rest_inputs)
+    default = rest + factor * (inputs - rest)
+    own = np.array([(one.low, one.high) for one in scene.inputs]).reshape(-1, 2)
+    bounded = np.isfinite(own).all(axis=1)
     pair = []
     for name, values in (
-        ("--low", np.minimum(default, 0.0) if low is None else low),
-        ("--high", np.maximum(default, 0.0) if high is None else high),
+        ("--low", np.where(bounded, own[:, 0], np.minimum(default, rest)) if low is None else low),
+        (
+            "--high",
+            np.where(bounded, own[:, 1], np.maximum(default, rest)) if high is None else high,
+        ),
     ):
         if len(values) not in (1, len(default)):
             raise ValueError(
-                f"{name}: got {len(values)} numbers, need one for all actuators or {len(default)}, "
+                f"{name}: got {len(values)} numbers, need one for all inputs or {len(default)}, "
                 f"one for each"
             )
         pair.append(np.broadcast_to(np.asarray(values, float), default.shape))

@@ -59,7 +59,7 @@ def _reach(options: argparse.Namespace) -> int:
 
     task = task_of(options)
     check_folders(options.json)
-    low, high = bounds(options.low, options.high, 2 * np.asarray(task.inputs))
+    low, high = bounds(options.low, options.high, task.scene, np.asarray(task.inputs), 2)
     model = model_between(task, options.tolerance, low, high)
     found = reach(
         task.scene,

@@ -46,7 +46,7 @@ def lines(
     tip = np.asarray(found["tip"])
     text.append(f"  tip        {_vector(tip[:3, 3])} m")
     if error:
-        finer = solve(eq.scene, eq.inputs, model=eq.model.finer())
+        finer = solve(eq.given_scene, eq.inputs, model=eq.model.finer())
         far = float(np.linalg.norm(np.asarray(finer.tip)[:3, 3] - tip[:3, 3]))
         text.append(f"  error      {far:.2g} m of the tip from a finer solve, with {eq.model}")
     text += [
@@ -102,23 +102,20 @@ def record(eq: Equilibrium, found: Summary | None) -> dict[str, Any]:
 
 
 def _threads(eq: Equilibrium, found: Values) -> list[str]:
-    actuators = eq.scene.actuators
+    actuators, given = eq.scene.actuators, eq.given_scene.inputs
+    values = [f"{_number(value)} {one.unit}" for one, value in zip(given, eq.inputs, strict=True)]
     columns = [
         ["", *map(str, range(len(actuators)))],
         ["actuator", *(type(actuator).__name__ for actuator in actuators)],
-        [
-            "input",
-            *(
-                f"{_number(value)} {actuator.unit}"
-                for actuator, value in zip(actuators, eq.inputs, strict=True)
-            ),
-        ],
+        ["input", *values[: len(actuators)]],
         ["force [N]", *map(_number, found["forces"])],
         ["length [m]", *map(_number, found["lengths"])],
     ]
     if eq.scene.length_driven:
         columns.append(["slack [m]", *map(_number, found["slack"])])
-    return _table(list(zip(*columns, strict=True))) if actuators else []
+    table = _table(list(zip(*columns, strict=True))) if actuators else []
+    driven = list(zip(given, values, strict=True))[len(actuators) :]
+    return table + _table([("driven", "input")] * bool(driven) + [(x.name, y) for x, y in driven])
 
 
 def _table(rows: Sequence[Sequence[str]]) -> list[str]:

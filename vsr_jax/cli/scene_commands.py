@@ -152,7 +152,7 @@ def read_task(
     """The task of a scene file, with the default model.
 
     **Arguments:** `path`: the file; `inputs`: from the command line, None for those of the file;
-    `precision`: of all numbers; `at_rest`: whether the inputs are zeros where there are none.
+    `precision`: of all numbers; `at_rest`: whether they are those at rest where there are none.
 
     **Raises:** `ValueError` for an invalid file or invalid numbers.
     """
@@ -160,10 +160,10 @@ def read_task(
     scene, stored, title = load(path)
     values = stored if inputs is None else inputs
     if values is None:
-        if scene.actuators and not at_rest:
-            kinds = ", ".join(type(actuator).__name__ for actuator in scene.actuators)
+        if scene.inputs and not at_rest:
+            kinds = ", ".join(one.name for one in scene.inputs)
             raise ValueError(f"{path}: has no inputs, need --inputs, one number each for {kinds}")
-        values = [0.0] * len(scene.actuators)
+        values = scene.rest_inputs
     return SceneTask(scene, jnp.asarray(values, precision), None, title)
 
 

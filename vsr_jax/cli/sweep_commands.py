@@ -70,11 +70,11 @@ def add_sweep(commands: Any) -> None:
 def _sweep(options: argparse.Namespace) -> int:
     task = task_of(options)
     check_folders(options.out, options.plot)
-    actuators, dtype = len(task.scene.actuators), task.inputs.dtype
-    low, high = bounds(options.low, options.high, np.asarray(task.inputs))
+    dtype = task.inputs.dtype
+    low, high = bounds(options.low, options.high, task.scene, np.asarray(task.inputs))
     inputs = (
         np.random.default_rng(options.seed)
-        .uniform(low, high, (options.samples, actuators))
+        .uniform(low, high, (options.samples, len(low)))
         .astype(dtype)
     )
     model = model_between(task, options.tolerance, low, high)

@@ -73,7 +73,7 @@ def _view(options: argparse.Namespace) -> int:
         model = solve(task.scene, task.inputs, tolerance=options.tolerance).model
     ends = None
     if options.low is not None or options.high is not None:
-        ends = bounds(options.low, options.high, 2 * np.asarray(task.inputs))
+        ends = bounds(options.low, options.high, task.scene, np.asarray(task.inputs), 2)
     with _interrupts_end():
         view(
             task.scene,

@@ -24,6 +24,7 @@ from jaxtyping import Array, Float
 from ..arm.actuator import Chamber, Tendon, Thread
 from ..arm.composite import Composite, Inclusion
 from ..arm.discs import Discs
+from ..arm.driven import Input
 from ..arm.fields import arguments
 from ..arm.held import Held
 from ..arm.loads import DistributedWrench, Gravity, PointWrench, TipWrench
@@ -78,6 +79,7 @@ _GROUPS = {
     ),
     "held": _group(Held),
     "obstacles": _group(Plane, Sphere, Cylinder, Box, Tube),
+    "driven": _group(Input),
 }
 """Classes that are possible under a key; profiles under every other key."""
 

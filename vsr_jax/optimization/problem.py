@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from ..analysis.arms import Arms
 from ..analysis.constraint import Constraint, Inside
+from ..arm.driven import check_free
 from ..arm.scene import Scene
 from ..arm.scene_numbers import matching, parameters, replaced
 from ..models.base import Model
@@ -93,6 +94,9 @@ def formulate(
         INPUTS: sets
     }
     low, high = _bounds(free, known)
+    open_ends = {name: np.asarray(high[name] > low[name]).reshape(-1) for name in low}
+    moved = ((name, i) for name, some in open_ends.items() for i in np.flatnonzero(some).tolist())
+    check_free(scene, scene.driven, moved)
     minimised.check(sets.shape[0], high.get("rod.length", scene.rod.length))
     if INPUTS in low:
         for end in (low[INPUTS], high[INPUTS]):
@@ -114,7 +118,7 @@ def _sets(scene: Scene, inputs: ArrayLike) -> Float[Array, "sets inputs"]:
     sets = numbers("inputs", inputs, None, finite=False)
     if sets.ndim != 2 or not len(sets):
         raise ValueError(
-            f"inputs: got shape {sets.shape}, need (sets, {len(scene.actuators)}), one row per "
+            f"inputs: got shape {sets.shape}, need (sets, {len(scene.inputs)}), one row per "
             f"set of inputs"
         )
     for row in sets:

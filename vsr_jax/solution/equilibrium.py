@@ -49,9 +49,9 @@ class Equilibrium(Solved):
     arm's length. It raises `ValueError` for an X beyond the arm if both are concrete, and is NaN
     there under `jax.jit`.
 
-    **Fields:** `scene`, `inputs` [units of the actuators], `model`; `status`, a `Status` as an
-    integer; `steps`, the number of Newton steps (integration steps for `Continuum`); `state`, the
-    internal state of the model.
+    **Fields:** `scene`, with its driven numbers at the inputs; `inputs` [units of the actuators and
+    driven numbers]; `model`; `status`, a `Status` as an integer; `steps`, the number of Newton
+    steps (integration steps for `Continuum`); `state`, the internal state of the model.
     """
 
     scene: Scene
@@ -63,13 +63,20 @@ class Equilibrium(Solved):
     state: Any
     _loosened: Array | None
     _restarted: Array | None
+    _given: Scene | None
 
     def __init__(
         self, scene: Scene, inputs: Float[Array, " inputs"], model: Model, outcome: Outcome
     ):
-        self.scene, self.inputs, self.model = scene, inputs, model
+        self.scene, self.inputs, self.model = scene.at(inputs), inputs, model
+        self._given = scene if scene.driven else None
         self.state, self._forces, self.status, self.steps = outcome[:4]
         self._loosened, self._restarted = outcome.loosened, outcome.restarted
+
+    @property
+    def given_scene(self) -> Scene:
+        """The scene that was solved, with its driven numbers as it was made."""
+        return self.scene if self._given is None else self._given
 
     @property
     def outcome(self) -> Outcome:
@@ -242,7 +249,7 @@ class Equilibrium(Solved):
         """Slack of each tendon that is driven by its length [m]. Zero while it is taut, and for all
         other threads."""
         nodes, scene = self.nodes, self.scene
-        slack = jnp.zeros_like(self.inputs)
+        slack = jnp.zeros(len(scene.actuators), self.inputs.dtype)
         for place in scene.length_driven:
             cable = driven_of(scene, self.inputs[place], place, nodes.sections, nodes.grid)
             tension = -self.sound_forces[place]

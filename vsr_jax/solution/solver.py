@@ -46,8 +46,8 @@ def solve(
     **Arguments:**
     - `scene`: rod, actuators and loads.
     - `inputs`: one number per actuator: tau [N] for a `Thread`, tension [N] for a `Tendon` or its
-      change of length [m] with `control="length"`, pressure [Pa] for a `Chamber`. Their dtype is
-      the precision of the whole computation.
+      change of length [m] with `control="length"`, pressure [Pa] for a `Chamber`; then the numbers
+      that the scene has `driven`. Their dtype is the precision of the whole computation.
     - `model`: `StrainDependent()` by default, which balances every cross-section on given steps;
       `Prescribed(basis)`, which restricts the strain to a basis; `Continuum()`, which integrates
       with adaptive steps.
@@ -142,10 +142,12 @@ def checked_outcome(
     solver: Callable[[Scene, Array], Outcome],
 ) -> Outcome:
     """Outcome of a solver for admissible inputs, with the status of others and of steps that do not
-    resolve the shape."""
+    resolve the shape. The solver gets the scene with its driven numbers at the inputs."""
     given = status_of_inputs(scene, inputs)
     admitted = given == Status.CONVERGED
-    outcome = resolved(model, scene, solver(scene, jnp.where(admitted, inputs, 0.0)))
+    inputs = jnp.where(admitted, inputs, scene.rest_inputs if scene.driven else 0.0)
+    there = scene.at(inputs)
+    outcome = resolved(model, there, solver(there, inputs))
     return outcome._replace(status=jnp.where(admitted, outcome.status, given))
 
 

@@ -207,7 +207,7 @@ def _worst(errors: np.ndarray) -> np.ndarray:
 
 def _samples(scene: Scene, inputs_range: VectorLike | Sequence[VectorLike]) -> Array:
     """Corners of the range, all or a random selection, and random inputs between them."""
-    size = len(scene.actuators)
+    size = len(scene.inputs)
     low, high = interval("inputs_range", inputs_range, size)
     scene.check_inputs(low)
     scene.check_inputs(high)
@@ -254,6 +254,7 @@ class _Trial(StrainDependent):
 
 def _tip_of(scene: Scene, inputs: Array, model: StrainDependent) -> tuple[Array, Array]:
     """Position of the tip, NaN where the solve failed, and the status."""
+    scene = scene.at(inputs)
     outcome = model.solve(scene, inputs)
     sound = outcome.status == Status.CONVERGED
     tip = model.tip(scene, forces_where(sound, outcome.forces), outcome.state)[:3, 3]

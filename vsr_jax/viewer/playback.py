@@ -89,7 +89,7 @@ def tracks_of(session: Session, play: Playable | Sequence[Playable] | None) -> l
             )
         return [Track("path", _frames_of(play))]
     rows = np.asarray(numbers("play", play, None), float)
-    size = len(session.scene.actuators)
+    size = len(session.scene.inputs)
     if rows.ndim != 2 or rows.shape[1] != size or not len(rows):
         raise ValueError(
             f"play: got shape {rows.shape}, need (samples, {size}), one row of inputs per frame"

@@ -58,7 +58,7 @@ class Session:
 
     **Arguments:**
     - `scene`: the scene.
-    - `inputs`: one number per actuator, by default zeros. Their dtype is the precision.
+    - `inputs`: as for `solve`, by default those at rest. Their dtype is the precision.
     - `numbers`: names of numbers with a slider, or a mapping to their ranges, see
       `sliders.number_sliders`.
     - `bounds`: least and greatest inputs, see `sliders.input_sliders`.
@@ -83,10 +83,7 @@ class Session:
         compiling: Callable[[str], None] = lambda what: None,
     ):
         instance("scene", scene, Scene, "a Scene")
-        dtype = scene.rod.length.dtype
-        given = scene.check_inputs(
-            jnp.zeros(len(scene.actuators), dtype) if inputs is None else inputs
-        )
+        given = scene.check_inputs(scene.rest_inputs if inputs is None else inputs)
         self.scene = cast(scene, given.dtype)
         self.model = StrainDependent() if model is None else model
         instance("model", self.model, Model, "StrainDependent(), Prescribed(basis) or Continuum()")

@@ -72,7 +72,7 @@ def input_sliders(scene: Scene, inputs: np.ndarray, bounds: Any = None) -> list[
 
     **Arguments:** `bounds`: least and greatest inputs, as for `reach`. By default the range from 0
     to twice the greatest input of the same kind; where all are 0, inputs that bend the arm alone by
-    about 2 rad.
+    about 2 rad. That of a driven number is its own, or else reaches visibly to both sides.
 
     **Raises:** `ValueError` for bounds that contradict each other, an actuator or the inputs.
     """
@@ -82,10 +82,14 @@ def input_sliders(scene: Scene, inputs: np.ndarray, bounds: Any = None) -> list[
         low, high = (np.asarray(end, float) for end in interval("bounds", bounds, len(inputs)))
         scene.check_inputs(low)
         scene.check_inputs(high)
+    threads = len(scene.actuators)
     return [
-        _checked(Slider(f"{INPUTS}[{i}]", INPUTS, (i,), actuator.unit, *ends), inputs[i])
-        for i, (actuator, ends) in enumerate(
-            zip(scene.actuators, np.stack([low, high], axis=-1).tolist(), strict=True)
+        _checked(
+            Slider(f"{INPUTS}[{i}]" if i < threads else one.name, INPUTS, (i,), one.unit, *ends),
+            inputs[i],
+        )
+        for i, (one, ends) in enumerate(
+            zip(scene.inputs, np.stack([low, high], axis=-1).tolist(), strict=True)
         )
     ]
 
@@ -170,12 +174,16 @@ def _default_bounds(scene: Scene, inputs: np.ndarray) -> tuple[np.ndarray, np.nd
     low, high = np.zeros(len(inputs)), np.zeros(len(inputs))
     kinds = [(type(actuator), actuator.unit) for actuator in scene.actuators]
     for i, actuator in enumerate(scene.actuators):
-        alike = inputs[[kind == kinds[i] for kind in kinds]]
+        alike = inputs[: len(kinds)][[kind == kinds[i] for kind in kinds]]
         if np.any(alike):
             low[i], high[i] = 2 * min(alike.min(), 0.0), 2 * max(alike.max(), 0.0)
         else:
             size = _visible_input(scene, actuator)
             low[i], high[i] = -size * (actuator.lowest < 0), size
+    for i, one in enumerate(scene.inputs[len(kinds) :], start=len(kinds)):
+        size = _visible_number(scene, one.unit) or abs(inputs[i]) or 1.0
+        low[i] = one.low if np.isfinite(one.low) else inputs[i] - size
+        high[i] = one.high if np.isfinite(one.high) else inputs[i] + size
     return low, high
 
 

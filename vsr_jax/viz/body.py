@@ -126,8 +126,9 @@ def body_from_samples(eq: Equilibrium, samples: Summary) -> Body:
     areas = [np.nan if x.pressure_area is None else float(x.pressure_area) for x in actuators]
     area, unknown = np.array(areas), np.array([x.law_driven for x in actuators], bool)
     forces, inflated = np.asarray(samples.values["forces"]), ~np.isnan(area)
+    given = np.asarray(eq.inputs)[: len(area)]
     tension = np.where(inflated, np.nan, -forces)
-    pressure = np.where(inflated, np.where(unknown, forces / area, np.asarray(eq.inputs)), np.nan)
+    pressure = np.where(inflated, np.where(unknown, forces / area, given), np.nan)
     between = jnp.asarray(samples.X[1:] + samples.X[:-1]) / 2
     flexible = eq.scene.rod.flexible(between)
     rigid = np.zeros(between.shape, bool) if flexible is None else np.asarray(flexible) == 0
@@ -138,7 +139,7 @@ def at_rest(eq: Equilibrium) -> Equilibrium:
     """The arm without loads and inputs."""
     with quietly():
         scene = Scene(eq.scene.rod, eq.scene.actuators, free_strains=eq.scene.free_strains)
-    return solve(scene, jnp.zeros_like(eq.inputs), model=eq.model)
+    return solve(scene, jnp.zeros(len(scene.actuators), eq.inputs.dtype), model=eq.model)
 
 
 def thread_scales(bodies: Sequence[Body]) -> Scales:
