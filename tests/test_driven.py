@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 
@@ -100,7 +101,8 @@ def test_driven_numbers_are_those_of_a_scene_made_with_them(name):
     eq = vsr.solve(make(), u, model=MODEL)
     scene, inputs = by_hand(name, u)
     same = vsr.solve(scene, inputs, model=MODEL)
-    assert eq.converged and not eq.scene.driven
+    assert eq.converged
+    assert not eq.scene.driven
     np.testing.assert_allclose(eq.tip, same.tip, atol=1e-13)
     np.testing.assert_allclose(eq.stability, same.stability, rtol=1e-9)
     np.testing.assert_allclose(eq.energy.total, same.energy.total, rtol=1e-9, atol=1e-15)
@@ -178,16 +180,15 @@ def test_poses_move_along_and_about_their_own_axes():
 )
 def test_a_scene_refuses(driven, message):
     held = vsr.Held(position=(0.19, 0.0, 0.02))
-    with pytest.raises(ValueError) as error:
+    with pytest.raises(ValueError, match=re.escape(message)):
         vsr.Scene(rod(), held=held, driven=driven)
-    assert message in str(error.value)
 
 
 def test_an_input_refuses():
     for wrong in ({"low": 1.0, "high": 0.0}, {"low": (0.0, 2.0), "high": 1.0}, {"high": np.nan}):
         with pytest.raises(ValueError, match="Input"):
             vsr.Input("rod.length", **wrong)
-    with pytest.raises(ValueError, match="Input.number"):
+    with pytest.raises(ValueError, match=r"Input\.number"):
         vsr.Input(())
 
 
@@ -198,7 +199,7 @@ def test_inputs_are_checked():
     ):
         with pytest.raises(ValueError, match=message):
             vsr.solve(rolled(), u)
-    with pytest.raises(ValueError, match="rod.length"):
+    with pytest.raises(ValueError, match=r"rod\.length"):
         vsr.solve(vsr.Scene(rod(), driven=vsr.Input("rod.length")), [-0.1])
 
 
@@ -276,9 +277,9 @@ def test_a_path_of_a_gripper_is_followed():
 def test_fits_and_designs_refuse_driven_numbers():
     markers = vsr.Markers(np.zeros((2, 3)), sd=1e-3)
     data = vsr.Measurements([[0.0, 0.1, 0.0], [0.0, 0.2, 0.0]], markers)
-    with pytest.raises(ValueError, match="rod.length, which is an input of the scene"):
+    with pytest.raises(ValueError, match=r"rod\.length, which is an input of the scene"):
         vsr.fit(inserted(), {"rod.length": (0.1, 0.3)}, data)
-    with pytest.raises(ValueError, match="rod.length, which is an input of the scene"):
+    with pytest.raises(ValueError, match=r"rod\.length, which is an input of the scene"):
         vsr.design(inserted(), {"rod.length": (0.1, 0.3)}, lambda arms: 0.0, [[0.0, 0.1, 0.0]])
 
 
@@ -297,7 +298,7 @@ def test_commands_take_them(tmp_path, capsys):
     vsr.save(rolled(), file, [1.0, 0.6, 0.02])
     assert main(["solve", str(file), "--steps", "6"]) == 0
     said = capsys.readouterr().out
-    assert all(name in said for name in names) and "0.6 rad" in said
+    assert all(name in said for name in (*names, "0.6 rad"))
     assert main(["sweep", str(file), "--steps", "6", "--samples", "4"]) == 0
     assert "-3.2 to 3.2" in capsys.readouterr().out
     assert main(["check", str(file), "--steps", "6"]) == 0

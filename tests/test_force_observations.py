@@ -25,7 +25,7 @@ def gripped(young=1e6):
 
 def grips():
     rng = np.random.default_rng(0)
-    places = [0.18, 0.0, 0.01] + rng.uniform(-0.01, 0.01, (6, 3))
+    places = np.array([0.18, 0.0, 0.01]) + rng.uniform(-0.01, 0.01, (6, 3))
     return np.concatenate([places, rng.uniform(-0.4, 0.4, (6, 3))], axis=1)
 
 

@@ -19,6 +19,7 @@ PACKAGES = (
     "elements",
     "models",
     "solution",
+    "assembly",
     "files",
     "fabrication",
     "analysis",

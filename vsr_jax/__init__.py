@@ -79,6 +79,7 @@ if TYPE_CHECKING:
         parameters,
         pose,
     )
+    from .assembly import Assembly, AssemblyEquilibrium, Body, Joint, solve_assembly
     from .calibration import (
         Comparison,
         ContactForces,
@@ -141,7 +142,10 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Annular",
+    "Assembly",
+    "AssemblyEquilibrium",
     "Basis",
+    "Body",
     "Box",
     "Branch",
     "Chamber",
@@ -178,6 +182,7 @@ __all__ = [
     "Input",
     "InputPath",
     "Joined",
+    "Joint",
     "Legendre",
     "LikelihoodProfile",
     "Linear",
@@ -266,6 +271,7 @@ __all__ = [
     "se3",
     "sensitivity",
     "solve",
+    "solve_assembly",
     "step_twist",
     "stiffness_matrix",
     "sweep",
@@ -277,6 +283,7 @@ __all__ = [
 _PACKAGES = (
     "analysis",
     "arm",
+    "assembly",
     "calibration",
     "files",
     "models",

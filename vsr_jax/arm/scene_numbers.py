@@ -36,7 +36,7 @@ class Parameter(NamedTuple):
     `pose`, whether it is a pose or a rotation.
     """
 
-    value: Array
+    value: Any
     unit: str
     powers: bool
     way: Way

@@ -1,0 +1,320 @@
+"""Assemblies against single arms with the same meaning, closed forms, and shooting in SciPy."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+import vsr_jax as vsr
+
+L, MODEL = 0.2, vsr.StrainDependent(16)
+
+
+def rod(length=L, base=None, young=1e6):
+    material = vsr.Material(young, poisson=0.45, density=1080.0)
+    return vsr.Rod(length, vsr.Circular(0.004), material, base=base)
+
+
+def at(position, rotation=None):
+    pose = np.eye(4)
+    pose[:3, :3] = np.eye(3) if rotation is None else rotation.as_matrix()
+    pose[:3, 3] = position
+    return pose
+
+
+UP = Rotation.from_matrix([[0, 0, 1], [0, 1, 0], [-1, 0, 0]]).inv()
+
+
+def loaded(young=1e6):
+    arm = vsr.Scene(rod(young=young), loads=vsr.Gravity())
+    plate = vsr.Body(at([L, 0, 0]), mass=0.001, centre=(0.01, 0.0, 0.0), moment=(0, 0, 2e-5))
+    return vsr.Assembly(arm, plate, vsr.Joint(0, 0, pose=np.eye(4)))
+
+
+def with_payload(young=1e6):
+    loads = [vsr.Gravity(), vsr.Payload(0.001, offset=(0.01, 0.0, 0.0))]
+    return vsr.Scene(rod(young=young), loads=[*loads, vsr.TipWrench(moment=(0, 0, 2e-5))])
+
+
+@pytest.mark.slow
+def test_a_plate_on_an_arm_is_a_payload():
+    eq, same = (
+        vsr.solve_assembly(loaded(), [], model=MODEL),
+        vsr.solve(with_payload(), [], model=MODEL),
+    )
+    assert eq.converged
+    np.testing.assert_allclose(eq.poses[0], same.tip, atol=1e-7)
+    np.testing.assert_allclose(eq.arms[0].tip, eq.poses[0], atol=1e-7)
+    weight = 0.001 * 9.81
+    np.testing.assert_allclose(eq.arms[0].supports[0, 3:], [0, 0, -weight], atol=1e-9 * weight)
+    # stiffness of a tip against wrenches: the inverse of its compliance, in the body's axes
+    turn = np.kron(np.eye(2), np.asarray(same.tip[:3, :3]))
+    compliance = turn.T @ np.asarray(vsr.compliance(same)) @ turn
+    np.testing.assert_allclose(np.linalg.inv(eq.stiffness), compliance, rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.slow
+def test_derivatives_are_those_of_the_payload():
+    def height(young):
+        return vsr.solve_assembly(loaded(young), [], model=MODEL).poses[0, 2, 3]
+
+    def same(young):
+        return vsr.solve(with_payload(young), [], model=MODEL).tip[2, 3]
+
+    wanted = jax.grad(same)(1e6)
+    np.testing.assert_allclose(jax.grad(height)(1e6), wanted, rtol=1e-6)
+    np.testing.assert_allclose(jax.jvp(height, (1e6,), (1.0,))[1], wanted, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_two_arms_one_after_the_other_are_a_long_one():
+    """The second arm has its base on a body without mass at the tip of the first."""
+    arm = vsr.Scene(rod(), loads=vsr.Gravity())
+    second = vsr.Scene(rod(base=at([L, 0, 0])), loads=vsr.Gravity())
+    clamp = vsr.Body(at([L, 0, 0]))
+    chain = vsr.Assembly([arm, second], clamp, [vsr.Joint(0, 0), vsr.Joint(1, 0, X=0.0)])
+    eq = vsr.solve_assembly(chain, [], model=MODEL)
+    whole = vsr.solve(vsr.Scene(rod(2 * L), loads=vsr.Gravity()), [], model=MODEL)
+    assert eq.converged
+    np.testing.assert_allclose(eq.arms[1].tip, whole.tip, atol=2e-6)
+    np.testing.assert_allclose(eq.poses[0], whole.pose(L), atol=2e-6)
+
+
+@pytest.mark.slow
+def test_an_arm_joined_to_the_ground_is_held():
+    place = at([0.17, 0.01, 0.02], Rotation.from_rotvec([0.1, 0.2, 0.3]))
+    held = vsr.Held(position=place[:3, 3], orientation=place)
+    arm, tendon = rod(), vsr.Tendon(vsr.Parallel(0.003, 0.0))
+    same = vsr.solve(vsr.Scene(arm, tendon, vsr.Gravity(), held=held), [0.3], model=MODEL)
+    joint = vsr.Joint(0, pose=place)
+    eq = vsr.solve_assembly(
+        vsr.Assembly(vsr.Scene(arm, tendon, vsr.Gravity()), joints=joint), [0.3], model=MODEL
+    )
+    assert eq.converged
+    np.testing.assert_allclose(eq.arms[0].supports, same.supports, rtol=1e-8, atol=1e-10)
+    np.testing.assert_allclose(eq.stability, same.stability, rtol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["ball", "hinge", "slider"])
+def test_joints_bear_nothing_where_they_move(kind):
+    """An arm under gravity whose tip is joined to the ground."""
+    place = at([0.18, 0.01, 0.0], Rotation.from_rotvec([0.0, 0.2, 0.1]))
+    axis = None if kind == "ball" else (0.0, 1.0, 0.2)
+    joint = vsr.Joint(0, kind=kind, pose=place, axis=axis)
+    assembly = vsr.Assembly(vsr.Scene(rod(), loads=vsr.Gravity()), joints=joint)
+    eq = vsr.solve_assembly(assembly, [], model=MODEL)
+    assert eq.converged
+    tip, (wrench,) = np.asarray(eq.arms[0].tip), np.asarray(eq.arms[0].supports)
+    a = place[:3, :3] @ np.array([0.0, 1.0, 0.2]) / np.hypot(1.0, 0.2)
+    if kind == "ball":
+        np.testing.assert_allclose(wrench[:3], 0, atol=1e-12)
+    elif kind == "hinge":
+        np.testing.assert_allclose(wrench[:3] @ a, 0, atol=1e-9)
+        along = np.array([0.0, 1.0, 0.2]) / np.hypot(1.0, 0.2)
+        np.testing.assert_allclose(tip[:3, :3] @ along, a, atol=1e-9)
+        assert np.linalg.norm(wrench[:3]) > 1e-5
+    if kind == "slider":
+        np.testing.assert_allclose(wrench[3:] @ a, 0, atol=1e-9)
+        np.testing.assert_allclose(tip[:3, :3], place[:3, :3], atol=1e-6)
+        off = tip[:3, 3] - place[:3, 3]
+        np.testing.assert_allclose(np.cross(off, a), 0, atol=1e-6)
+    else:
+        np.testing.assert_allclose(tip[:3, 3], place[:3, 3], atol=1e-6)
+
+
+HEIGHT, BASE, PLATE = 0.3, 0.06, 0.05
+WEIGHT = 0.4 * 9.81
+
+
+def anchors():
+    angles = 2 * np.pi / 6 * np.arange(6)
+    twist = np.where(np.arange(6) % 2, 0.25, -0.25)
+    return [
+        (BASE * np.array([np.cos(a), np.sin(a), 0]), PLATE * np.array([np.cos(b), np.sin(b), 0]))
+        for a, b in zip(angles, angles + twist, strict=True)
+    ]
+
+
+def hexapod(places=None):
+    """Six nylon rods that motors push out of the ground, with a plate on them."""
+    arms, joints = [], []
+    for k, (p, q) in enumerate(anchors()):
+        q = q if places is None else places[k]
+        material = vsr.Material(2e9, poisson=0.4, density=1150.0)
+        leg = vsr.Rod(HEIGHT, vsr.Circular(0.002), material, base=at(p, UP))
+        arms.append(vsr.Scene(leg, driven=vsr.Input("rod.length", low=0.1, high=0.5)))
+        pose = jnp.asarray(at([0, 0, 0], UP)).at[:3, 3].set(jnp.asarray(q))
+        joints.append(vsr.Joint(k, 0, pose=pose))
+    plate = vsr.Body(at([0, 0, 0.998 * HEIGHT]), mass=0.4)  # the legs hardly strained
+    return vsr.Assembly(arms, plate, joints)
+
+
+LENGTHS = HEIGHT + np.array([0.01, -0.005, 0.015, 0.0, 0.01, -0.01])
+
+
+def tip_of(leg, length, wrench):
+    """Place and rotation of the tip of a leg without weight, and the moment and force there, by
+    those at its base."""
+    base, stiffness = np.asarray(leg.rod.base), np.asarray(leg.rod.stiffness(0.0))
+    m0, n = wrench[:3], wrench[3:]
+
+    def slope(_, y):
+        R, m = y[3:12].reshape(3, 3), y[12:]
+        strain = np.concatenate([R.T @ m, R.T @ n]) / stiffness + [0, 0, 0, 1, 0, 0]
+        u = R @ strain[3:]
+        w = R @ strain[:3]
+        turn = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]]) @ R
+        return np.concatenate([u, turn.ravel(), -np.cross(u, n)])
+
+    start = np.concatenate([base[:3, 3], base[:3, :3].ravel(), m0])
+    y = solve_ivp(slope, (0, length), start, method="DOP853", rtol=1e-11, atol=1e-13).y[:, -1]
+    return y[:3], y[3:12].reshape(3, 3), np.concatenate([y[12:], n])
+
+
+def shooting(assembly, lengths, guess, places):
+    """Base wrenches of the legs and the pose of the plate (rotation vector, position) by Newton's
+    method: 36 rows say that the legs end in the plate, 6 that it is in balance."""
+
+    def ends(z, k):
+        return tip_of(assembly.arms[k], lengths[k], z[6 * k : 6 * k + 6])
+
+    def rows(z, legs):
+        R, r = Rotation.from_rotvec(z[36:39]).as_matrix(), z[39:]
+        found, total = [], np.array([0, 0, 0, 0, 0, -WEIGHT])
+        for (place, turn, wrench), q in zip(legs, places, strict=True):
+            off = (R @ UP.as_matrix()).T @ turn
+            found += [*(place - r - R @ q), *Rotation.from_matrix(off).as_rotvec()]
+            # what a leg carries it takes from the plate
+            total[:3] -= wrench[:3] + np.cross(R @ q, wrench[3:])
+            total[3:] -= wrench[3:]
+        return np.array([*found, *total])
+
+    def moved(z, legs, j, step):
+        """The rows with one unknown changed: those of a leg change that leg alone."""
+        z = z + step * np.eye(42)[j]
+        legs = [ends(z, k) if k == j // 6 else leg for k, leg in enumerate(legs)]
+        return rows(z, legs)
+
+    z = guess.copy()
+    for _ in range(4):
+        legs = [ends(z, k) for k in range(6)]
+        steps = 1e-6 * np.maximum(1.0, np.abs(z))
+        J = [(moved(z, legs, j, h) - moved(z, legs, j, -h)) / (2 * h) for j, h in enumerate(steps)]
+        change = np.linalg.solve(np.transpose(J), rows(z, legs))
+        z = z - change
+        if np.max(np.abs(change)) < 1e-9:
+            break
+    return z, rows(z, [ends(z, k) for k in range(6)])
+
+
+def guess_from(eq):
+    wrenches = []
+    for arm in eq.arms:
+        R = np.asarray(arm.scene.rod.base)[:3, :3]
+        inner = np.asarray(arm.reaction(0.0))
+        wrenches += [*(R @ inner[:3]), *(R @ inner[3:])]
+    turn = Rotation.from_matrix(np.asarray(eq.poses[0, :3, :3])).as_rotvec()
+    return np.array([*wrenches, *turn, *np.asarray(eq.poses[0, :3, 3])])
+
+
+@pytest.mark.slow
+def test_six_rods_with_a_plate_are_those_of_shooting_in_space():
+    """Pose and reactions; and the derivative of the height by an anchor against a difference of
+    solutions by shooting."""
+    model = vsr.StrainDependent(16)
+    assembly, places = hexapod(), [q for _, q in anchors()]
+    eq = vsr.solve_assembly(assembly, LENGTHS, model=model)
+    assert eq.converged
+    assert eq.stability > 0
+    z, rest = shooting(assembly, LENGTHS, guess_from(eq), places)
+    assert np.max(np.abs(rest)) < 1e-9
+    np.testing.assert_allclose(eq.poses[0, :3, 3], z[39:], atol=1e-6 * HEIGHT)
+    R = Rotation.from_rotvec(z[36:39]).as_matrix()
+    np.testing.assert_allclose(eq.poses[0, :3, :3], R, atol=1e-6)
+    np.testing.assert_allclose(guess_from(eq)[:36], z[:36], atol=1e-5 * WEIGHT)
+
+    def height(q):
+        moved = [q, *places[1:]]
+        return vsr.solve_assembly(hexapod(moved), LENGTHS, model=model, start=eq).poses[0, 2, 3]
+
+    slope = jax.grad(height)(jnp.asarray(places[0]))
+    step, along = 1e-4, np.array([0.6, -0.5, 0.62])
+    ends = [
+        shooting(assembly, LENGTHS, z, [places[0] + h * along, *places[1:]])[0][41]
+        for h in (step, -step)
+    ]
+    np.testing.assert_allclose(slope @ along, (ends[0] - ends[1]) / (2 * step), rtol=1e-4)
+
+
+@pytest.mark.slow
+def test_batches_and_warm_starts():
+    assembly, model = hexapod(), vsr.StrainDependent(8)
+    first = vsr.solve_assembly(assembly, LENGTHS, model=model)
+    further = jnp.array([LENGTHS + 0.002, LENGTHS - 0.002])
+    one = jax.jit(lambda u: vsr.solve_assembly(assembly, u, model=model, start=first))
+    eqs = jax.vmap(one)(further)
+    assert np.all(np.asarray(eqs.converged))
+    again = vsr.solve_assembly(assembly, further[0], model=model)
+    np.testing.assert_allclose(eqs.poses[0], again.poses, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_plate_too_heavy_for_its_column_is_found_where_it_hangs():
+    """A column far above its buckling load, with a force to one side: the search begins where the
+    whole is unstable. The same arm with the loads at its tip is stable there."""
+    arm = vsr.Scene(rod(base=at([0, 0, 0], UP)))
+    plate = vsr.Body(at([0, 0, L], UP), mass=0.02, force=(0.02, 0.005, 0.0))
+    assembly = vsr.Assembly(arm, plate, vsr.Joint(0, 0, pose=np.eye(4)))
+    eq = vsr.solve_assembly(assembly, [], model=MODEL)
+    assert eq.converged
+    assert eq.stability > 0
+    loads = vsr.TipWrench(force=(0.02, 0.005, -0.02 * 9.81))
+    same = vsr.solve(vsr.Scene(arm.rod, loads=loads), [], model=MODEL)
+    np.testing.assert_allclose(eq.poses[0], same.tip, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda a, b: vsr.Assembly([]), "Assembly.arms: got none"),
+        (lambda a, b: vsr.Assembly(a, b), "bodies[0]: got no joint, need one that holds it"),
+        (lambda a, b: vsr.Assembly(a, b, vsr.Joint(1, 0)), "joints[0].arm: got 1, need the index"),
+        (lambda a, b: vsr.Assembly(a, b, vsr.Joint(0, 2)), "joints[0].body: got 2, need the index"),
+        (lambda a, b: vsr.Assembly(a, b, vsr.Joint(0, 0, X=0.3)), "joints[0].X: got 0.3 m, need"),
+        (
+            lambda a, b: vsr.Assembly(a, b, [vsr.Joint(0, 0), vsr.Joint(0, None, "ball")]),
+            "joints[1]: got the section of joints[0] again",
+        ),
+        (lambda a, b: vsr.Joint(0, None, "ball", X=0.0), "Joint.kind: got 'ball' at X = 0"),
+        (lambda a, b: vsr.Assembly(a, (), vsr.Joint(0, X=0.0)), "got a base on the ground"),
+        (lambda a, b: vsr.Joint(0, axis=(1, 0, 0)), "Joint.axis: got (1, 0, 0) with kind='fixed'"),
+        (lambda a, b: vsr.Joint(0, kind="hinge", axis=(0, 0, 0)), "Joint.axis: got (0, 0, 0)"),
+    ],
+)
+def test_what_an_assembly_refuses(make, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        make(vsr.Scene(rod()), vsr.Body(at([L, 0, 0])))
+
+
+def test_inputs_of_an_assembly():
+    assembly = hexapod()
+    assert [one.name for one in assembly.inputs][5] == "arms[5] rod.length"
+    np.testing.assert_allclose(assembly.rest_inputs, HEIGHT)
+    for u, message in ((LENGTHS[:5], "need (6,)"), ([*LENGTHS[:5], 0.7], "arms[5]: inputs[0]")):
+        with pytest.raises(ValueError, match=re.escape(message)):
+            vsr.solve_assembly(assembly, u)
+
+
+@pytest.mark.slow
+def test_lengths_that_cannot_meet_have_a_status():
+    """An inextensible arm that is joined to the ground beyond its length."""
+    arm = vsr.Scene(rod(), free_strains=("torsion", "bending_y", "bending_z"))
+    assembly = vsr.Assembly(arm, joints=vsr.Joint(0, pose=at([1.1 * L, 0.0, 0.0])))
+    eq = vsr.solve_assembly(assembly, [], model=vsr.StrainDependent(8))
+    assert not eq.converged
+    assert np.isnan(eq.stability)
