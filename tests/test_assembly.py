@@ -65,9 +65,8 @@ def test_derivatives_are_those_of_the_payload():
     def same(young):
         return vsr.solve(with_payload(young), [], model=MODEL).tip[2, 3]
 
-    wanted = jax.grad(same)(1e6)
-    np.testing.assert_allclose(jax.grad(height)(1e6), wanted, rtol=1e-6)
-    np.testing.assert_allclose(jax.jvp(height, (1e6,), (1.0,))[1], wanted, rtol=1e-6)
+    found = jax.jvp(height, (1e6,), (1.0,))[1]  # backwards: with the six rods below
+    np.testing.assert_allclose(found, jax.grad(same)(1e6), rtol=1e-6)
 
 
 @pytest.mark.slow

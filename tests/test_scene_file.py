@@ -247,8 +247,8 @@ MISTAKES = [
     (
         "[rod]",
         "[road]",
-        r"^unknown key 'road', known are actuators, free_strains, held, inputs, loads, obstacles, "
-        r"rod, title; did you mean 'rod'\?$",
+        r"^unknown key 'road', known are actuators, driven, free_strains, held, inputs, loads, "
+        r"obstacles, rod, title; did you mean 'rod'\?$",
     ),
     (
         '"Circular"',

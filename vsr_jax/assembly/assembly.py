@@ -4,17 +4,19 @@ from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from ..arm.description import Part, describe, table
 from ..arm.driven import InputRange
+from ..arm.plausible import quietly
+from ..arm.rod import Rod
 from ..arm.scene import Scene
 from ..models.strain_dependent import StrainDependent
-from ..numerics.se3 import base_pose, inverse
-from ..typing import Pose, VectorLike
+from ..numerics.compiling import program
+from ..numerics.se3 import base_pose, exp, inverse, log
+from ..typing import Pose, Scalar, VectorLike
 from ..validation import concrete, instances, numbers
 from .body import Body
 from .joint import Joint
@@ -43,6 +45,7 @@ class Assembly(Part):
     bodies: tuple[Body, ...]
     joints: tuple[Joint, ...]
     gravity: Float[Array, "3"] = eqx.field(metadata={"unit": "m/s^2"})
+    _rest_poses: tuple[Pose, ...]
 
     def __init__(
         self,
@@ -64,7 +67,11 @@ class Assembly(Part):
         for i in range(len(self.bodies)):
             if all(joint.body != i for joint in given):
                 raise ValueError(f"Assembly.bodies[{i}]: got no joint, need one that holds it")
-        self.joints = tuple(self._placed_joint(joint) for joint in given)
+        rods = [self.arms[joint.arm].rod for joint in given]
+        self._rest_poses = tuple(_rest_pose(*pair) for pair in zip(rods, given, strict=True))
+        self.joints = tuple(
+            self._placed_joint(*pair) for pair in zip(given, self._rest_poses, strict=True)
+        )
 
     def __repr__(self) -> str:
         names = ("arms", "bodies", "joints")
@@ -133,29 +140,46 @@ class Assembly(Part):
             jnp.stack([b.pose for b in self.bodies]) if self.bodies else jnp.zeros((0, 4, 4), dtype)
         )
 
-    def _placed_joint(self, joint: Joint) -> Joint:
+    def _placed_joint(self, joint: Joint, rest: Pose) -> Joint:
         """The joint with a pose: where its section lies at rest, if it has none."""
         if joint.pose is not None:
             return joint
-        pose = _rest_pose(self.arms[joint.arm], joint)
-        if joint.body is not None:
-            pose = inverse(self.bodies[joint.body].pose) @ pose
-        return eqx.tree_at(lambda j: j.pose, joint, pose, is_leaf=lambda x: x is None)
+        return joint.moved(self._on_body(joint, rest))
+
+    def _on_body(self, joint: Joint, pose: Pose) -> Pose:
+        """A pose in the world on the body of a joint, with the bodies in their own poses."""
+        return pose if joint.body is None else inverse(self.bodies[joint.body].pose) @ pose
+
+    def assembled(self, share: Scalar) -> "Assembly":
+        """The assembly on the way from arms at rest, which nothing strains, at 0, to itself at 1:
+        with each joint moved on its body by a share of the way there from where its section lies at
+        rest."""
+        joints = []
+        for joint, rest in zip(self.joints, self._rest_poses, strict=True):
+            assert joint.pose is not None
+            first = self._on_body(joint, rest)
+            joints.append(joint.moved(first @ exp(share * log(inverse(first) @ joint.pose))))
+        return eqx.tree_at(lambda a: a.joints, self, tuple(joints))
 
 
 def _based(scene: Scene, base: Pose) -> Scene:
     return eqx.tree_at(lambda s: s.rod.base, scene, base, is_leaf=lambda x: x is None)
 
 
-def _rest_pose(scene: Scene, joint: Joint) -> Pose:
-    rod = scene.rod
+def _rest_pose(rod: Rod, joint: Joint) -> Pose:
+    """Where the section of a joint lies at rest, in the world."""
     if joint.at_base:
         return jnp.asarray(base_pose(rod.frame, rod.length.dtype))
-    bare, model = Scene(rod), StrainDependent()
-    X = rod.length if joint.X is None else joint.X
-    rest = model.at_rest(bare, rod.length.dtype)
-    found = jax.jit(lambda X: model.poses(bare, rest.forces, rest.state, X[None]))(X)
-    return found[0]
+    with quietly():
+        bare = Scene(rod)
+    return _pose_at_rest(bare, rod.length if joint.X is None else joint.X)
+
+
+@program("rest pose")
+def _pose_at_rest(scene: Scene, X: Scalar) -> Pose:
+    model = StrainDependent()
+    rest = model.at_rest(scene, X.dtype)
+    return model.poses(scene, rest.forces, rest.state, X[None])[0]
 
 
 def _check_joint(path: str, joint: Joint, arms: Sequence[Scene], bodies: int) -> None:

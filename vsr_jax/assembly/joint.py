@@ -81,6 +81,10 @@ class Joint(Part):
         assert self.pose is not None
         return self.pose if self.body is None else poses[self.body] @ self.pose
 
+    def moved(self, pose: Pose) -> "Joint":
+        """The joint with another pose."""
+        return eqx.tree_at(lambda j: j.pose, self, pose, is_leaf=lambda x: x is None)
+
     def support(self, frame: Pose) -> "JointSupport":
         """The joint as its arm has it, in a pose in the world."""
         return JointSupport(self.X, frame, self.axis, self.kind)

@@ -5,7 +5,8 @@ force) on each, in its own axes; its derivative by motions of the bodies in thei
 from the implicit derivatives of the arms, which are solved between their joints from their last
 shapes. Arms of one structure are solved side by side by one program.
 
-The inputs go from those of the start, or from rest, to the given ones, at once if they can. A step
+The inputs go from those of the start, or from rest, to the given ones, at once if they can; without
+a start the joints go with them, from where the sections lie at rest. A step
 is $K^{-1} (f + \Delta f)$ with the change of the wrench by the inputs, or downhill along the
 eigenvectors of K where it is not positive definite, at most as long as a radius. It is taken if all
 arms are solved there and the wrench along the step has not turned against it by more than
@@ -94,9 +95,10 @@ def solve_assembly(
     its gradient is $-f$, and its second derivative the stiffness matrix $K = -\partial f / \partial
     x$. The whole is stable if K is positive definite and the arms are stable between their joints.
     Newton's method takes steps $K^{-1} f$, downhill where K is indefinite, from the poses that the
-    bodies have or from those of `start`; on the way the inputs go from those at rest, or of the
-    start, to the given ones. It needs poses where the arms are hardly strained. Batch with
-    `jax.vmap`; first derivatives by every number and input are implicit.
+    bodies have or from those of `start`. On the way the inputs go from those at rest, or of the
+    start, to the given ones; without a start, the joints go from where their sections lie at rest
+    to their places on the bodies. Batch with `jax.vmap`; first derivatives by every number and
+    input are implicit.
 
     **Arguments:**
     - `inputs`: those of the first arm, then those of the second, and so on. Their dtype is the
@@ -289,7 +291,9 @@ def _search(whole: _Whole, start: AssemblyEquilibrium | None) -> _Search:
     )
 
     def at(share: Array) -> _Whole:
-        return whole._replace(inputs=first_inputs + share * (whole.inputs - first_inputs))
+        inputs = first_inputs + share * (whole.inputs - first_inputs)
+        assembly = whole.assembly.assembled(share) if start is None else whole.assembly
+        return whole._replace(inputs=inputs, assembly=assembly)
 
     def proceed(here: _Search) -> Array:
         lost = jnp.minimum(here.radius / _RADIUS, here.ahead) < _LEAST
