@@ -19,11 +19,13 @@ from mpl_toolkits.mplot3d.axes3d import Axes3D
 from ..arm.loads import Gravity
 from ..arm.obstacles import Obstacle
 from ..arm.rod import STRAINS
+from ..assembly import AssemblyEquilibrium
 from ..solution.equilibrium import Equilibrium
 from ..solution.summary import Summary
 from ..typing import ArrayLike, VectorLike
 from ..validation import choice
 from . import annotate
+from .bodies import draw_bodies
 from .body import body_of, draw_body, sample, thread_scales
 from .obstacles import draw_obstacles, draw_outlines
 from .space import (
@@ -42,6 +44,7 @@ __all__ = [
     "COLORS",
     "LABELS",
     "arm",
+    "assembly",
     "equal_scale",
     "sample",
     "shade",
@@ -134,6 +137,36 @@ def arm(
         _legend(ax, slack, widening, own)
     if own and threads and scales is not None:
         color_bars(ax, scales)
+    return ax
+
+
+def assembly(
+    eq: AssemblyEquilibrium,
+    ax: Axes3D | None = None,
+    *,
+    color: ColorType = COLORS[0],
+    stations: int = 60,
+    surface: bool = True,
+) -> Axes3D:
+    """The arms of a solved assembly, each as by `arm` without details, and its bodies: each a
+    translucent plate between its joints, with its axes.
+
+    **Arguments:** `eq`: one solved assembly; `ax`: 3D axes, by default a new figure; `color`: of
+    the arms; `stations`, `surface`: as for `arm`.
+
+    **Returns:** the axes.
+
+    **Raises:** `ValueError` for a solve that failed.
+    """
+    if not bool(eq.converged):
+        raise ValueError(f"eq: got a solve that failed, {eq.message}; need an equilibrium to draw")
+    own, ax = ax is None, checked_space(ax)
+    for one in eq.arms:
+        arm(one, ax, color=color, stations=stations, surface=surface)
+    draw_bodies(ax, eq, ink(0.5))
+    equal_scale(ax, thinnest=_THINNEST if own else THINNEST_BOX)
+    if own:
+        fit_height(ax, _AREA)
     return ax
 
 
