@@ -2,6 +2,7 @@
 
 import re
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -81,6 +82,50 @@ def test_two_arms_one_after_the_other_are_a_long_one():
     assert eq.converged
     np.testing.assert_allclose(eq.arms[1].tip, whole.tip, atol=2e-6)
     np.testing.assert_allclose(eq.poses[0], whole.pose(L), atol=2e-6)
+
+
+@pytest.mark.slow
+def test_the_roll_of_a_round_arm_on_a_body_does_not_matter():
+    """The base of the second arm is driven: its wrench is that of the turned section."""
+    arm = vsr.Scene(rod(), loads=vsr.Gravity())
+    roll = vsr.Input("rod.base.turn_x")
+    second = vsr.Scene(rod(base=at([L, 0, 0])), loads=vsr.Gravity(), driven=roll)
+    joints = [vsr.Joint(0, 0), vsr.Joint(1, 0, X=0.0)]
+    chain = vsr.Assembly([arm, second], vsr.Body(at([L, 0, 0])), joints)
+    rolls = jnp.array([[0.0], [1.0], [np.pi]])
+    eqs = jax.vmap(lambda u: vsr.solve_assembly(chain, u, model=vsr.StrainDependent(8)))(rolls)
+    assert np.all(np.asarray(eqs.converged))
+    tips = jax.vmap(lambda eq: eq.arms[1].tip[:3, 3])(eqs)
+    np.testing.assert_allclose(tips, np.broadcast_to(tips[0], (3, 3)), atol=1e-9)
+
+
+@pytest.mark.slow
+def test_refused_inputs_have_their_status_and_leave_the_others_alone():
+    place = at([0.17, 0.01, 0.02])
+    arm = vsr.Scene(rod(), vsr.Tendon(vsr.Parallel(0.003, 0.0)), vsr.Gravity())
+    assembly, model = vsr.Assembly(arm, joints=vsr.Joint(0, kind="ball", pose=place)), MODEL
+
+    def mean(young, tensions):
+        there = eqx.tree_at(lambda a: a.arms[0].rod.material.young.value, assembly, young)
+        eqs = jax.vmap(lambda u: vsr.solve_assembly(there, u[None], model=model))(tensions)
+        tips = jax.vmap(lambda eq: eq.arms[0].position(0.1)[2])(eqs)
+        return jnp.sum(jnp.where(eqs.converged, tips, 0.0)), eqs
+
+    tensions = jnp.array([0.3, -1.0, jnp.nan])
+    slope, eqs = jax.grad(mean, has_aux=True)(jnp.asarray(1e6), tensions)
+    wanted = [vsr.Status.CONVERGED, vsr.Status.INADMISSIBLE, vsr.Status.NOT_FINITE]
+    np.testing.assert_array_equal(eqs.status, wanted)
+    np.testing.assert_array_equal(eqs.arms[0].status, wanted)
+    assert np.isfinite(slope)
+
+
+@pytest.mark.slow
+def test_a_body_that_is_free_to_turn_is_not_stable():
+    ball = vsr.Body(at([L, 0, 0]), mass=0.001)
+    arm = vsr.Scene(rod(), loads=vsr.Gravity())
+    whole = vsr.Assembly(arm, ball, vsr.Joint(0, 0, "ball", pose=np.eye(4)))
+    eq = vsr.solve_assembly(whole, [], model=vsr.StrainDependent(8))
+    assert eq.status == vsr.Status.UNSTABLE
 
 
 @pytest.mark.slow
@@ -192,6 +237,10 @@ def test_a_plate_too_heavy_for_its_column_is_found_where_it_hangs():
         (lambda a, b: vsr.Assembly(a, b, vsr.Joint(0, 0, X=0.3)), "joints[0].X: got 0.3 m, need"),
         (
             lambda a, b: vsr.Assembly(a, b, [vsr.Joint(0, 0), vsr.Joint(0, None, "ball")]),
+            "joints[1]: got the section of joints[0] again",
+        ),
+        (
+            lambda a, b: vsr.Assembly(a, b, [vsr.Joint(0, 0), vsr.Joint(0, None, "ball", X=L)]),
             "joints[1]: got the section of joints[0] again",
         ),
         (lambda a, b: vsr.Joint(0, None, "ball", X=0.0), "Joint.kind: got 'ball' at X = 0"),

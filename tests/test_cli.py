@@ -311,10 +311,18 @@ def test_the_default_bounds_of_negative_forces_end_at_zero(capsys):
     arguments = ["sweep", HELIX, "--samples", "3", "--steps", "8"]
     assert cli.main(arguments) == cli_common.DONE
     assert "inputs      -5 to 0\nsamples     3 converged\n" in capsys.readouterr().out
-    low, high = cli_common.bounds(None, None, np.array([-2.0, 0.0, 3.0]))
+    vsr = vsr_jax
+    threads = [vsr.Thread(vsr.Parallel(y, 0.0)) for y in (-0.001, 0.0, 0.001)]
+    rod = vsr.Rod(0.2, vsr.Circular(0.004), vsr.Material(1e6))
+    scene = vsr.Scene(rod, threads)
+    low, high = cli_common.bounds(None, None, scene, np.array([-2.0, 0.0, 3.0]))
     assert (low.tolist(), high.tolist()) == ([-2.0, 0.0, 0.0], [0.0, 0.0, 3.0])
-    low, high = cli_common.bounds([-1.0], None, np.array([-2.0, 3.0]))
-    assert (low.tolist(), high.tolist()) == ([-1.0, -1.0], [0.0, 3.0])
+    scene = vsr.Scene(rod, threads[:1], driven=vsr.Input("rod.length", low=0.1))
+    low, high = cli_common.bounds([-1.0], None, scene, np.array([-2.0, 0.3]))
+    assert (low.tolist(), high.tolist()) == ([-1.0, -1.0], [0.0, 0.3])
+    scene = vsr.Scene(rod, driven=vsr.Input("rod.length", low=0.1, high=0.3))
+    low, high = cli_common.bounds(None, None, scene, np.array([0.25]))
+    assert (low.tolist(), high.tolist()) == ([0.1], [0.3])
 
 
 def test_bounds_of_a_sweep_are_in_order(capsys):
@@ -325,7 +333,7 @@ def test_bounds_of_a_sweep_are_in_order(capsys):
 def test_bounds_of_a_sweep_are_one_or_one_an_actuator(capsys):
     assert cli.main(["sweep", HELIX, "--low", "1", "2"]) == cli_common.BAD_USAGE
     assert (
-        "--low: got 2 numbers, need one for all actuators or 1, one for each"
+        "--low: got 2 numbers, need one for all inputs or 1, one for each"
         in capsys.readouterr().err
     )
 

@@ -15,6 +15,7 @@ from jaxtyping import Array
 from scipy.spatial.transform import Rotation
 
 import vsr_jax as vsr
+from vsr_jax.analysis.arms import Arms
 from vsr_jax.cli.main import main
 
 L, MODEL = 0.2, vsr.StrainDependent(6)
@@ -201,6 +202,38 @@ def test_inputs_are_checked():
             vsr.solve(rolled(), u)
     with pytest.raises(ValueError, match=r"rod\.length"):
         vsr.solve(vsr.Scene(rod(), driven=vsr.Input("rod.length")), [-0.1])
+
+
+@pytest.mark.slow
+def test_checks_scale_driven_numbers_of_loads_from_rest():
+    health = vsr.check(carried(), [0.26, 0.09, 0.02], model=vsr.StrainDependent(4))
+    assert health.equilibrium.converged
+    assert health.inputs is not None
+
+
+@pytest.mark.slow
+def test_constraints_see_the_arm_at_the_inputs():
+    """A length of 0.1 on an arm of 0.2: stations and scales are those of the shorter one."""
+    curved = vsr.constraint.BendRadius(0.01)
+    short = vsr.Scene(rod(0.1), TENDON, vsr.Gravity())
+    eqs = vsr.solve(inserted(), [0.8, 0.1, 0.0], model=MODEL), vsr.solve(short, [0.8], model=MODEL)
+    found, wanted = (curved(Arms.of(eq)) for eq in eqs)
+    np.testing.assert_allclose(found, wanted, rtol=1e-9)
+    J = Arms.of(eqs[0]).each(vsr.tip_jacobian)[0]
+    np.testing.assert_allclose(J, vsr.tip_jacobian(eqs[0]), rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_refused_inputs_leave_gradients_of_the_others_alone():
+    inputs = jnp.array([[1.0, 0.5, 0.0], [1.0, jnp.nan, 0.0]])
+
+    def height(length):
+        scene = rolled().replace("rod.length", length)
+        eqs = jax.vmap(lambda u: vsr.solve(scene, u, model=MODEL))(inputs)
+        tips = jax.vmap(lambda eq: eq.tip[2, 3])(eqs)
+        return jnp.sum(jnp.where(eqs.converged, tips, 0.0))
+
+    assert np.isfinite(jax.grad(height)(0.2))
 
 
 @pytest.mark.slow

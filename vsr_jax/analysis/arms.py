@@ -26,7 +26,7 @@ class Arms(eqx.Module):
     def of(cls, eq: Equilibrium) -> "Arms":
         """One arm: the scene solved for one set of inputs."""
         sets = jax.tree.map(lambda x: x[None], (eq.inputs, eq.outcome))
-        return cls(eq.scene, sets[0], eq.model, sets[1])
+        return cls(eq.given_scene, sets[0], eq.model, sets[1])
 
     def each(self, function: Callable, *arrays: Array) -> PyTree:
         """`jax.vmap` of `function` over the `Equilibrium` of each set, and over the first axis of
@@ -36,3 +36,10 @@ class Arms(eqx.Module):
             return function(Equilibrium(self.scene, inputs, self.model, outcome), *more)
 
         return jax.vmap(one)(self.inputs, self.outcome, *arrays)
+
+    def each_scene(self, function: Callable[[Scene], Array]) -> Array:
+        """`function` of the scene of each set or, where no input changes it, of the one scene, with
+        a leading axis."""
+        if not self.scene.driven:
+            return function(self.scene)[None]
+        return jax.vmap(lambda u: function(self.scene.at(u)))(self.inputs)

@@ -12,8 +12,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..arm.obstacles import Obstacle
+from ..arm.scene import Scene
 from ..mechanics.sizes import softest
-from ..solution.bearing import Contact
+from ..solution.equilibrium import Equilibrium
 from ..typing import Scalar, ScalarLike
 from ..validation import instances, numbers, positive
 from .arms import Arms
@@ -42,8 +43,9 @@ def _text(value: Any) -> str:
     return f"[{', '.join(type(one).__name__ for one in value)}]"
 
 
-def _stations(arms: Arms) -> Float[Array, " stations"]:
-    return arms.scene.rod.length * jnp.linspace(0, 1, _STATIONS, dtype=arms.inputs.dtype)
+def _stations(scene: Scene) -> Float[Array, " stations"]:
+    length = scene.rod.length
+    return length * jnp.linspace(0, 1, _STATIONS, dtype=length.dtype)
 
 
 class Inside(Constraint):
@@ -59,11 +61,14 @@ class Inside(Constraint):
         self.wall = numbers("Inside.wall", wall, least=0.0)
 
     def __call__(self, arms: Arms) -> Float[Array, " margins"]:
-        rod, X = arms.scene.rod, _stations(arms)
+        return arms.each_scene(self._room).reshape(-1)
+
+    def _room(self, scene: Scene) -> Float[Array, " margins"]:
+        rod, X = scene.rod, _stations(scene)
         zero = jnp.zeros_like(self.wall)
         middle = jax.vmap(lambda x: rod.clearance(zero, zero, x))(X)
         rows = []
-        for actuator in arms.scene.actuators:
+        for actuator in scene.actuators:
             inside = jax.vmap(lambda x, a=actuator: rod.clearance(*a.routing(x), x))(X)
             rows.append(_where_laid((inside - self.wall) / middle, jax.vmap(actuator.reach)(X)))
         return jnp.concatenate(rows) if rows else jnp.ones(1, X.dtype)
@@ -82,7 +87,10 @@ class MinSpacing(Constraint):
         self.gap = positive("MinSpacing.gap", gap)
 
     def __call__(self, arms: Arms) -> Float[Array, " margins"]:
-        X, threads = _stations(arms), arms.scene.actuators
+        return arms.each_scene(self._apart).reshape(-1)
+
+    def _apart(self, scene: Scene) -> Float[Array, " margins"]:
+        X, threads = _stations(scene), scene.actuators
         paths = [jax.vmap(actuator.routing)(X) for actuator in threads]
         reach = [jax.vmap(actuator.reach)(X) for actuator in threads]
         rows = []
@@ -125,7 +133,7 @@ class BendRadius(Constraint):
         self.least = positive("BendRadius.least", least)
 
     def __call__(self, arms: Arms) -> Float[Array, " margins"]:
-        strain = arms.each(lambda eq: eq.strain(_stations(arms)))
+        strain = arms.each(lambda eq: eq.strain(_stations(eq.scene)))
         return (1 - self.least**2 * (strain[..., 1] ** 2 + strain[..., 2] ** 2)).reshape(-1)
 
 
@@ -176,31 +184,33 @@ class Clearance(Constraint):
                 raise ValueError(f"Clearance.obstacles: got none, need {needed}")
 
     def __call__(self, arms: Arms) -> Float[Array, " margins"]:
-        gaps = _pressed(arms) if self.obstacles is None else _gaps(arms, self.obstacles)
-        return ((gaps - self.distance) / arms.scene.rod.length).reshape(-1)
+        if self.obstacles is None:
+            _check_obstacles(arms, "Clearance", "in the scene or in Clearance(distance, obstacles)")
+        return arms.each(self._far).reshape(-1)
+
+    def _far(self, eq: Equilibrium) -> Float[Array, "obstacles places"]:
+        gaps = _pressed(eq) if self.obstacles is None else _gaps(eq, self.obstacles)
+        return (gaps - self.distance) / eq.scene.rod.length
 
 
-def _pressed(arms: Arms) -> Float[Array, "sets obstacles places"]:
+def _pressed(eq: Equilibrium) -> Float[Array, "obstacles places"]:
     """Gaps to the obstacles of the scene [m], negative where the arm presses."""
-    contacts = _contacts(arms, "Clearance", "in the scene or in Clearance(distance, obstacles)")
-    rod = arms.scene.rod
-    bending = softest(jax.vmap(rod.stiffness)(_stations(arms)))
+    rod, contacts = eq.scene.rod, eq.contacts
+    bending = softest(jax.vmap(rod.stiffness)(_stations(eq.scene)))
     return contacts.gap - contacts.force * rod.length**3 / (3 * jnp.mean(bending))
 
 
-def _gaps(arms: Arms, obstacles: tuple[Obstacle, ...]) -> Float[Array, "obstacles sets stations"]:
+def _gaps(eq: Equilibrium, obstacles: tuple[Obstacle, ...]) -> Float[Array, "obstacles stations"]:
     """Least gap [m] to each obstacle near each station."""
-    X = _stations(arms)
-    places, radius = arms.each(lambda eq: eq.position(X)), jax.vmap(arms.scene.rod.outline)(X)
-    distances = [jax.vmap(jax.vmap(one.distance))(places) for one in obstacles]
+    X = _stations(eq.scene)
+    places, radius = eq.position(X), jax.vmap(eq.scene.rod.outline)(X)
+    distances = [jax.vmap(one.distance)(places) for one in obstacles]
     return _least(jnp.stack(distances) - radius)
 
 
-def _contacts(arms: Arms, name: str, where: str) -> Contact:
-    """Contacts of each set with the obstacles of the scene."""
+def _check_obstacles(arms: Arms, name: str, where: str) -> None:
     if not arms.scene.obstacles:
         raise ValueError(f"{name}: got a scene without obstacles, need obstacles {where}")
-    return arms.each(lambda eq: eq.contacts)
 
 
 def _least(gaps: Float[Array, "*rest stations"]) -> Float[Array, "*rest stations"]:
@@ -226,5 +236,6 @@ class MaxContactForce(Constraint):
         self.force = positive("MaxContactForce.force", force)
 
     def __call__(self, arms: Arms) -> Float[Array, " margins"]:
-        forces = _contacts(arms, "MaxContactForce", "in the scene").force
+        _check_obstacles(arms, "MaxContactForce", "in the scene")
+        forces = arms.each(lambda eq: eq.contacts.force)
         return 1 - jnp.sum(forces, axis=-1).reshape(-1) / self.force

@@ -126,7 +126,8 @@ def _completed(scene: Scene, before: Near, inputs: Array, found: Outcome) -> Out
         # at rest the actuators exert nothing, and what is driven is where the path begins
         near, first = before, inputs[0].at[: len(scene.actuators)].set(0.0)
         if last.size:
-            near, first = _at(before, found, int(last[-1])), inputs[last[-1]]
+            place = int(last[-1])
+            near, first = _at(before, found, place, scene.at(inputs[place])), inputs[place]
         for parts in (parts for parts in _SMALLER if parts <= number):
             share = jnp.arange(1, parts + 1, dtype=inputs.dtype)[:, None] / parts
             way = _follow(scene, near, _padded(first + share * (inputs[i] - first), number))
@@ -134,7 +135,7 @@ def _completed(scene: Scene, before: Near, inputs: Array, found: Outcome) -> Out
                 continue
             there = [found, way]
             if i + 1 < number:
-                after = _at(before, way, parts - 1)
+                after = _at(before, way, parts - 1, scene.at(inputs[i]))
                 there.append(_follow(scene, after, _padded(inputs[i + 1 :], number)))
             found = jax.tree.map(partial(_joined, i, parts), *there)
             steps[i] = parts
@@ -148,10 +149,10 @@ def _completed(scene: Scene, before: Near, inputs: Array, found: Outcome) -> Out
     return found
 
 
-def _at(before: Near, found: Outcome, i: int) -> Near:
-    """Where a path goes on from a sample."""
+def _at(before: Near, found: Outcome, i: int, scene: Scene) -> Near:
+    """Where a path goes on from a sample, with the scene there."""
     forces, state = jax.tree.map(lambda x: x[i], (found.forces, found.state))
-    return before._replace(forces=forces, state=state)
+    return before._replace(scene=scene, forces=forces, state=state)
 
 
 def _padded(inputs: Array, number: int) -> Array:

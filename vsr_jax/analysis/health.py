@@ -219,12 +219,12 @@ def _check(eq: Equilibrium) -> Health:
     finer = solve(scene, inputs, model=model.finer())
 
     def status_at(of_inputs: Scalar, of_loads: Scalar) -> Array:
-        loads = tuple(load.scaled(of_loads) for load in scene.loads)
-        return solve(
-            eqx.tree_at(lambda scene: scene.loads, scene, loads),
-            rest + of_inputs * (inputs - rest),
-            model=model,
-        ).status
+        values = rest + of_inputs * (inputs - rest)
+        there = scene.at(values)
+        loads = tuple(load.scaled(of_loads) for load in there.loads)
+        there = eqx.tree_at(lambda scene: scene.loads, there, loads)
+        status = solve(there, values[: len(scene.actuators)], model=model).status
+        return jnp.where(scene.admits(values), status, Status.INADMISSIBLE)
 
     # one program for both searches, since compiling takes longer than solving
     grown = [True] * bool(scene.inputs) + [False] * bool(scene.loads)
@@ -238,7 +238,7 @@ def _check(eq: Equilibrium) -> Health:
     first, last = (jax.tree.map(lambda x, i=i: x[i], limits) for i in (0, -1))
     return Health(
         eq,
-        _independence(scene) if len(scene.actuators) > 1 else None,
+        _independence(eq.scene) if len(scene.actuators) > 1 else None,
         first if scene.inputs else None,
         last if scene.loads else None,
         norm(split(finer.tip[:3, 3] - eq.tip[:3, 3])),

@@ -170,7 +170,7 @@ class _ReachProblem(NamedTuple):
 
     def inputs(self, share: Array) -> Array:
         """Inputs at shares of the range between their bounds."""
-        return self.low + (self.high - self.low) * share
+        return jnp.minimum(self.low + (self.high - self.low) * share, self.high)
 
     @property
     def idle(self) -> Array:
@@ -230,7 +230,7 @@ def _check_target(target: Array, X: Array | None, scene: Scene) -> None:
     if target.shape == (4, 4):
         rigid("target", target)
     if X is not None:
-        on_arm("X", X, scene.rod.length)
+        on_arm("X", X, scene.greatest_length)
 
 
 def _check_bounds(
@@ -241,6 +241,7 @@ def _check_bounds(
         raise ValueError("scene: got no actuators, need at least one")
     low, high = interval("bounds", bounds, size)
     scene.check_inputs(low)
+    scene.check_inputs(high)
     return low.astype(dtype), high.astype(dtype)
 
 

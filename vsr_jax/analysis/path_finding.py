@@ -170,7 +170,9 @@ class _PathProblem(NamedTuple):
         """Inputs at the samples, for inner control points as shares of the ranges in a row."""
         ends = self.straight
         points = jnp.concatenate([ends[:1], share.reshape(ends[1:-1].shape), ends[-1:]])
-        return self.low + (self.high - self.low) * (self.curve @ points)
+        return jnp.clip(
+            self.low + (self.high - self.low) * (self.curve @ points), self.low, self.high
+        )
 
     def at(self, share: Array) -> Equilibrium:
         """Equilibria at the samples."""

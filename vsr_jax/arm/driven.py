@@ -184,7 +184,7 @@ def _ends(path: str, one: Input, name: str, size: int) -> list[float]:
 
 def check_free(scene: Part, inputs: Sequence[Input], places: Iterable[Place]) -> None:
     """Raises `ValueError` for a place whose number is an input, so that the scene's own one has no
-    effect: it cannot be found by a fit or a design."""
+    effect: it cannot be found by a fit or a design, nor moved by a slider."""
     if not inputs:
         return
     known = parameters(scene)
@@ -192,8 +192,8 @@ def check_free(scene: Part, inputs: Sequence[Input], places: Iterable[Place]) ->
     for place in places:
         if place in driven and not known[place[0]].pose:
             raise ValueError(
-                f"free: got {_name(known, place)}, which is an input of the scene; need numbers "
-                f"that the inputs do not give"
+                f"got {_name(known, place)}, which is an input of the scene; need numbers that the "
+                f"inputs do not give"
             )
 
 

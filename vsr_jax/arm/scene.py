@@ -30,6 +30,8 @@ from .scene_numbers import checked_values, replaced
 from .section_law import SectionLaw
 from .thread_lines import rest_length
 
+_LENGTH = "rod.length", 0
+
 
 class CrossSections(NamedTuple):
     r"""Cross-sections at given X: the diagonal of $\Sigma$ (6), $\xi^*$ (6), the `Path` of each
@@ -332,6 +334,12 @@ class Scene(Part):
         return (*threads, *(one.range for one in driven_by(self, self.driven)))
 
     @property
+    def greatest_length(self) -> Scalar | float:
+        """Length of the arm [m]; where an input drives it, its upper bound."""
+        ends = [one.range.high for one in driven_by(self, self.driven) if _LENGTH in one.places]
+        return ends[0] if ends else self.rod.length
+
+    @property
     def rest_inputs(self) -> Float[Array, " inputs"]:
         """Inputs without effort: zeros of the actuators, and driven numbers as the scene has
         them."""
@@ -350,6 +358,11 @@ class Scene(Part):
         values = real(inputs)[len(self.actuators) :]
         moved = with_driven(self, driven_by(self, self.driven), list(values))
         return eqx.tree_at(lambda scene: scene.driven, moved, ())
+
+    def without_bounds(self) -> "Scene":
+        """The scene with driven numbers that have no bounds."""
+        free = tuple(Input(one.number) for one in self.driven)
+        return eqx.tree_at(lambda scene: scene.driven, self, free) if free else self
 
     def admits(self, inputs: VectorLike) -> Bool[Array, ""]:
         """Whether every input is finite and in its range."""

@@ -63,7 +63,7 @@ class Assembly(Part):
             raise ValueError("Assembly.arms: got none, need at least one Scene")
         for i, joint in enumerate(given):
             _check_joint(f"Assembly.joints[{i}]", joint, self.arms, len(self.bodies))
-        _check_sections(given)
+        _check_sections(given, self.arms)
         for i in range(len(self.bodies)):
             if all(joint.body != i for joint in given):
                 raise ValueError(f"Assembly.bodies[{i}]: got no joint, need one that holds it")
@@ -108,9 +108,18 @@ class Assembly(Part):
         for i, (arm, own) in enumerate(zip(self.arms, self.split(values), strict=True)):
             try:
                 arm.check_inputs(own)
+                self._check_places(i, own)
             except ValueError as error:
                 raise ValueError(f"arms[{i}]: {error}") from None
         return values
+
+    def _check_places(self, arm: int, inputs: Array) -> None:
+        """Raises `ValueError` for joints beyond an arm whose length is an input."""
+        length = _known(self.arms[arm].at(inputs).rod.length)
+        for i, joint in self.jointed(arm):
+            X = _known(joint.X)
+            if X is not None and length is not None and length < X:
+                raise ValueError(f"joints[{i}].X: got {X:g} m on an arm of {length:g} m")
 
     def jointed(self, arm: int) -> list[tuple[int, Joint]]:
         """The joints of an arm with their places in `joints`, that of its base first."""
@@ -194,17 +203,26 @@ def _check_joint(path: str, joint: Joint, arms: Sequence[Scene], bodies: int) ->
         raise ValueError(f"{path}.X: got {X:g} m, need at most {length:g} m, the length of the arm")
 
 
-def _check_sections(joints: Sequence[Joint]) -> None:
-    """Raises `ValueError` for a section with two joints, whose rows contradict or repeat."""
-    taken: dict[Any, int] = {}
+def _check_sections(joints: Sequence[Joint], arms: Sequence[Scene]) -> None:
+    """Raises `ValueError` for a section that is held twice, so that its rows contradict or
+    repeat."""
+    taken: dict[tuple[int, float], str] = {}
+    for a, arm in enumerate(arms):
+        for i, held in enumerate(arm.held):
+            X = _known(held.place(arm.rod))
+            if X is not None:
+                taken[a, X] = f"arms[{a}].held[{i}]"
     for i, joint in enumerate(joints):
-        place = joint.arm, None if joint.X is None else _known(joint.X)
+        X = _known(arms[joint.arm].rod.length if joint.X is None else joint.X)
+        if X is None:
+            continue
+        place = joint.arm, X
         if place in taken:
             raise ValueError(
-                f"Assembly.joints[{i}]: got the section of joints[{taken[place]}] again, need one "
+                f"Assembly.joints[{i}]: got the section of {taken[place]} again, need one "
                 f"joint for each section"
             )
-        taken[place] = i
+        taken[place] = f"joints[{i}]"
 
 
 def _known(x: Any) -> float | None:

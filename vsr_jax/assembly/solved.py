@@ -25,7 +25,9 @@ class AssemblyEquilibrium(eqx.Module):
       length of the arms, in units of the arms' mean bending stiffness over that length: positive
       where the whole is stable. Without bodies the least margin of the arms.
     - `status`, `steps`, `inputs`, `model` and `assembly`: as of an `Equilibrium`; `search`, from
-      which another solve starts.
+      which another solve starts. A whole that nothing resists in some motion counts as unstable.
+
+    `poses` and `arms` have derivatives; `stiffness` and `stability` are constants in them.
     """
 
     assembly: Assembly

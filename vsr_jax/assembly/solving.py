@@ -31,7 +31,7 @@ from ..numerics.compiling import program
 from ..numerics.loops import while_loop
 from ..numerics.se3 import exp
 from ..solution.equilibrium import Equilibrium
-from ..solution.solver import outcome_of
+from ..solution.solver import outcome_of, status_of_inputs
 from ..typing import DTypeLike, VectorLike, cast
 from ..validation import instance
 from .assembly import Assembly
@@ -131,13 +131,35 @@ def _solved_whole(
     assembly: Assembly, inputs: Array, model: Model, start: AssemblyEquilibrium | None
 ) -> AssemblyEquilibrium:
     """The equilibrium; all arguments have one precision."""
-    whole = _Whole(assembly, inputs, model)
-    still = lax.stop_gradient(whole)
-    found = _search(still, lax.stop_gradient(start))
-    motion = _root(whole, found)
-    poses = moved(found.poses, motion * whole.scale.reshape(-1))
-    arms = whole.again(poses, found)
-    return _finished(whole, found, poses, arms)
+    own = zip(assembly.arms, assembly.split(inputs), strict=True)
+    refused = jnp.max(jnp.stack([status_of_inputs(arm, u) for arm, u in own]))
+    values = jnp.where(refused == Status.CONVERGED, inputs, assembly.rest_inputs)
+    whole = _Whole(assembly, values, model)
+    found = _search(lax.stop_gradient(whole), lax.stop_gradient(start))
+    poses = moved(found.poses, _root(whole, found) * whole.scale.reshape(-1))
+    status, least = _judged(lax.stop_gradient(whole), found)
+    status = jnp.where(refused == Status.CONVERGED, status, refused).astype(jnp.int32)
+    fine, unit = status == Status.CONVERGED, lax.stop_gradient(whole.scale.reshape(-1))
+    arms = [_with_status(eq, fine, status) for eq in whole.again(poses, found)]
+    if not found.wrench.size:
+        least = jnp.min(jnp.stack([eq.stability for eq in arms]))
+    return AssemblyEquilibrium(
+        assembly,
+        inputs,
+        model,
+        jnp.where(fine, poses, jnp.nan),
+        tuple(arms),
+        jnp.where(fine, found.stiffness / (unit[:, None] * unit), jnp.nan),
+        jnp.where(fine, least, jnp.nan),
+        status,
+        found.steps,
+        found.outcomes,
+    )
+
+
+def _with_status(eq: Equilibrium, fine: Array, status: Array) -> Equilibrium:
+    """An arm of an assembly, with the status of the whole where that failed."""
+    return eqx.tree_at(lambda arm: arm.status, eq, jnp.where(fine, eq.status, status))
 
 
 class _Whole(NamedTuple):
@@ -246,7 +268,9 @@ class _Whole(NamedTuple):
                     total[joint.body] += _on_body(poses[joint.body], pull, there[:3, 3])
             for _, joint in assembly.jointed(i):
                 if joint.at_base and joint.body is not None:
-                    section, inner = joint.in_world(poses), eq.reaction(jnp.zeros(()))
+                    # its own base may be driven: where it is, not where the joint is
+                    section, inner = eq.scene.rod.frame, eq.reaction(jnp.zeros(()))
+                    assert section is not None
                     R = section[:3, :3]
                     pull = jnp.concatenate([R @ inner[:3], R @ inner[3:]])
                     total[joint.body] += _on_body(poses[joint.body], pull, section[:3, 3])
@@ -317,10 +341,11 @@ def _search(whole: _Whole, start: AssemblyEquilibrium | None) -> _Search:
             by_inputs=by_inputs,
             ahead=jnp.where(begins, 1.0, jnp.minimum(2 * ahead + _LEAST, 1.0)),
             radius=jnp.where(begins, _RADIUS, jnp.minimum(2 * length + _RADIUS / 4, _RADIUS)),
-            size=jnp.where((ahead > 0) | (there.share < 1), jnp.inf, length),
+            size=jnp.where((ahead > 0) | (there.share < 1) | (limit < 1), jnp.inf, length),
         )
         # a last step is below rounding, and so may be the wrench
-        against = (f @ step < -_OVERSHOOT * (aim @ step)) & (length > small(dtype))
+        last = (length <= small(dtype)) & (limit == 1)
+        against = (f @ step < -_OVERSHOOT * (aim @ step)) & ~last
         taken = begins | (there.sound & ~against & jnp.all(jnp.isfinite(K)))
         cut = here._replace(
             radius=length / 2, ahead=jnp.where(ahead > 0, here.ahead / 2, here.ahead)
@@ -357,10 +382,11 @@ def _step(K: Array, f: Array, radius: Array) -> tuple[Array, Array, Array]:
     if not f.size:
         return f, jnp.zeros_like(radius), jnp.ones_like(radius)
     values, vectors = jnp.linalg.eigh((K + K.T) / 2)
-    least = small(K.dtype) * jnp.max(
-        jnp.abs(values)
-    )  # so that a neutral motion is not one by noise
-    downhill = vectors @ ((vectors.T @ f) / jnp.maximum(jnp.abs(values), least))
+    greatest, along = jnp.max(jnp.abs(values)), vectors.T @ f
+    least = small(K.dtype) * greatest
+    # a motion that nothing resists is left alone, but for a wrench beyond rounding
+    driven = (jnp.abs(values) > least) | (jnp.abs(along) > least)
+    downhill = vectors @ jnp.where(driven, along / jnp.maximum(jnp.abs(values), least), 0.0)
     step = jnp.where(values[0] > least, jnp.linalg.solve(K, f), downhill)
     length = jnp.max(jnp.linalg.norm(step.reshape(-1, 6), axis=1))
     share = jnp.minimum(1.0, radius / jnp.where(length > 0, length, 1.0))
@@ -382,36 +408,21 @@ def _root(whole: _Whole, found: _Search) -> Array:
     if not found.wrench.size:
         return jnp.zeros_like(found.wrench)
     f = (whole.wrench(found.poses, whole.again(found.poses, found)) * whole.scale).reshape(-1)
-    return jnp.linalg.solve(found.stiffness, f - lax.stop_gradient(f))
+    sound = jnp.all(jnp.isfinite(found.stiffness)) & found.sound
+    K = jnp.where(sound, found.stiffness, jnp.eye(f.size, dtype=f.dtype))
+    change = jnp.linalg.solve(K, f - lax.stop_gradient(f))
+    return jnp.where(sound, change, 0.0)
 
 
-def _finished(
-    whole: _Whole, found: _Search, poses: Array, arms: list[Equilibrium]
-) -> AssemblyEquilibrium:
-    size, scale = found.wrench.size, whole.scale.reshape(-1)
+def _judged(whole: _Whole, found: _Search) -> tuple[Array, Array]:
+    """`Status` of a search, and the least eigenvalue of the stiffness in units of bending."""
+    dtype, least = whole.inputs.dtype, jnp.full((), jnp.nan, whole.inputs.dtype)
+    ended = found.size <= small(dtype)
+    status = jnp.where(ended, Status.CONVERGED, Status.NOT_CONVERGED)
+    if found.wrench.size:
+        K = (found.stiffness + found.stiffness.T) / 2
+        least = jnp.linalg.eigvalsh(K)[0] / whole.bending
+        stable = least > jnp.finfo(dtype).eps ** 0.5
+        status = jnp.where(ended & ~stable, Status.UNSTABLE, status)
     worst = jnp.max(jnp.concatenate([one.status for one in found.outcomes]))
-    if size:
-        least = jnp.linalg.eigvalsh((found.stiffness + found.stiffness.T) / 2)[0] / whole.bending
-        status = jnp.where(
-            found.size <= small(whole.inputs.dtype), Status.CONVERGED, Status.NOT_CONVERGED
-        )
-        definite = least > jnp.finfo(whole.inputs.dtype).eps ** 0.5
-        status = jnp.where((status == Status.CONVERGED) & ~definite, Status.UNSTABLE, status)
-    else:
-        least = jnp.min(jnp.stack([eq.stability for eq in arms]))
-        status = jnp.full((), Status.CONVERGED)
-    ended = found.sound & (status != Status.CONVERGED)
-    status = jnp.where(ended, status, worst).astype(jnp.int32)
-    fine = status == Status.CONVERGED
-    return AssemblyEquilibrium(
-        whole.assembly,
-        whole.inputs,
-        whole.model,
-        jnp.where(fine, poses, jnp.nan),
-        tuple(arms),
-        jnp.where(fine, found.stiffness / (scale[:, None] * scale), jnp.nan),
-        jnp.where(fine, least, jnp.nan),
-        status,
-        found.steps,
-        found.outcomes,
-    )
+    return jnp.where(found.sound & (status != Status.CONVERGED), status, worst), least

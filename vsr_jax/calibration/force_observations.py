@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..arm.held import Held
+from ..arm.scene import Scene
 from ..numerics.se3 import exp
 from ..solution.equilibrium import Equilibrium
 from ..typing import ArrayLike, ScalarLike
@@ -143,6 +144,9 @@ class Reactions(Observation):
             found.append(_in_axes(sensor, moment) + self.moment_offset)
         return jnp.concatenate(found)
 
+    def check(self, scene: Scene) -> None:
+        _check_indices(f"{self.name}.held", self.held, len(scene.held), "held section")
+
     @staticmethod
     def _axes(eq: Equilibrium, i: int) -> Float[Array, "3 3"]:
         """Axes of what holds a section."""
@@ -214,6 +218,9 @@ class ContactForces(Observation):
         total = jnp.sum(each, axis=1)[jnp.array(self.obstacles)]
         return _in_axes(jax.vmap(_turned)(self.turn), total) + self.offset
 
+    def check(self, scene: Scene) -> None:
+        _check_indices(f"{self.name}.obstacles", self.obstacles, len(scene.obstacles), "obstacle")
+
     @property
     def labels(self) -> tuple[str, ...]:
         return tuple(f"{self.name}[{i}]" for i in self.obstacles)
@@ -226,6 +233,12 @@ class ContactForces(Observation):
 def _check_rows(name: str, value: Array, count: int, what: str) -> None:
     if value.shape[1] != count:
         raise ValueError(f"{name}: got {value.shape[1]} rows, need {count}, one for each {what}")
+
+
+def _check_indices(name: str, indices: Sequence[int], count: int, what: str) -> None:
+    for i in indices:
+        if not 0 <= i < count:
+            raise ValueError(f"{name}: got {i}, need the index of one of {count} {what}s, from 0")
 
 
 def _turned(vector: Array) -> Float[Array, "3 3"]:

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..arm.rod import Rod
+from ..arm.scene import Scene
 from ..numerics.se3 import rotation_vector
 from ..solution.equilibrium import Equilibrium
 from ..typing import ArrayLike, MatrixLike, ScalarLike, real
@@ -76,8 +76,8 @@ class Observation(eqx.Module):
         """Standard deviations up to a common factor where `sd` is None, to be broadcast."""
         return np.ones(())
 
-    def check(self, rod: Rod) -> None:
-        """Validates the observation for an arm.
+    def check(self, scene: Scene) -> None:
+        """Validates the observation for a scene.
 
         **Raises:** `ValueError` for abscissas beyond the arm.
         """
@@ -198,9 +198,9 @@ class Markers(Observation):
     def units(self) -> tuple[str, ...]:
         return ("m",) * len(self._labels)
 
-    def check(self, rod: Rod) -> None:
+    def check(self, scene: Scene) -> None:
         if self.X is not None:
-            on_arm(f"{self.name}.X", self.X, rod.length)
+            on_arm(f"{self.name}.X", self.X, scene.greatest_length)
 
 
 class Poses(Observation):
@@ -280,9 +280,9 @@ class Poses(Observation):
     def units(self) -> tuple[str, ...]:
         return ("m",) * len(self._labels) + ("rad",) * len(self._labels)
 
-    def check(self, rod: Rod) -> None:
+    def check(self, scene: Scene) -> None:
         if self.X is not None:
-            on_arm(f"{self.name}.X", self.X, rod.length)
+            on_arm(f"{self.name}.X", self.X, scene.greatest_length)
 
 
 class Curvatures(Observation):
@@ -329,5 +329,5 @@ class Curvatures(Observation):
     def units(self) -> tuple[str, ...]:
         return ("1/m",) * len(self._labels)
 
-    def check(self, rod: Rod) -> None:
-        on_arm(f"{self.name}.X", self.X, rod.length)
+    def check(self, scene: Scene) -> None:
+        on_arm(f"{self.name}.X", self.X, scene.greatest_length)

@@ -47,7 +47,8 @@ class Predictor(eqx.Module):
             eqx.tree_at(lambda o: (o.value, o.sd), one, (None, None), is_leaf=lambda x: x is None)
             for one in observations
         )
-        return cls(scene, model, empty, tuple(slots))
+        # a stage may have an offset: the ranges of inputs are those of the recorded ones
+        return cls(scene.without_bounds(), model, empty, tuple(slots))
 
     def set_up(self, numbers: Float[Array, " slots"]) -> tuple[Scene, tuple[Observation, ...]]:
         """The scene and the observations with given numbers."""

@@ -230,7 +230,7 @@ def formulate(
     for row in data.inputs:
         scene.check_inputs(row)
     for one in data.observations:
-        one.check(scene.rod)
+        one.check(scene)
     columns = columns_of(scene, data, free)
     check_positions(scene, data, columns)
     unknown = sum(column.high > column.low for column in columns)

@@ -207,7 +207,7 @@ class Fit:
         )
         places = jnp.zeros((len(rows), stations.size, 3), rows.dtype)
         axis = Markers(places, stations, name="axis")
-        axis.check(scene.rod)
+        axis.check(scene)
         model, slots = problem.predictor.model, problem.predictor.slots
         predictor = Predictor.of(scene, model, (axis,), slots)
         b, A = self._affine(rows, group)

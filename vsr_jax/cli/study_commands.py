@@ -174,10 +174,11 @@ def _accuracy(options: argparse.Namespace) -> int:
         read_task(options.scene, options.inputs) if options.scene else _two_helices(options.inputs)
     )
     shares = np.random.default_rng(0).uniform(0.1, 1.0, (options.batch_size, task.inputs.size))
+    rest = task.scene.rest_inputs
     settings = accuracy.settings(task.scene, groups=options.groups)
     rows = accuracy.measure(
         task.scene,
-        jnp.asarray(shares) * task.inputs,
+        rest + jnp.asarray(shares) * (task.inputs - rest),
         settings,
         report=lambda message: print(message, file=sys.stderr),
     )

@@ -159,14 +159,16 @@ class CurveError(Objective):
         )
 
     def __call__(self, arms: Arms) -> Scalar:
-        many, length = self.points.shape[-2], arms.scene.rod.length
-        X = length * jnp.arange(1, many + 1) / many if self.X is None else self.X
+        many = self.points.shape[-2]
         points = jnp.broadcast_to(self.points, (arms.inputs.shape[0], many, 3))
-        square = (
-            arms.each(lambda eq, target: jnp.sum((eq.position(X) - target) ** 2, axis=-1), points)
-            / length**2
-        )
-        return jnp.mean(square * (length / X) ** 4 if self.local else square)
+
+        def square(eq: Equilibrium, target: Array) -> Array:
+            length = eq.scene.rod.length
+            X = length * jnp.arange(1, many + 1) / many if self.X is None else self.X
+            found = jnp.sum((eq.position(X) - target) ** 2, axis=-1) / length**2
+            return found * (length / X) ** 4 if self.local else found
+
+        return jnp.mean(arms.each(square, points))
 
     def check(self, sets: int, longest: Scalar) -> None:
         if self.points.ndim == 3:
@@ -190,7 +192,7 @@ class Workspace(Objective):
         self.dimensions = dimensions
 
     def __call__(self, arms: Arms) -> Scalar:
-        tips = arms.each(lambda eq: eq.tip[:3, 3]) / arms.scene.rod.length
+        tips = arms.each(lambda eq: eq.tip[:3, 3] / eq.scene.rod.length)
         off = tips - jnp.mean(tips, axis=0)
         spread = jnp.linalg.eigvalsh(off.T @ off / tips.shape[0])[-self.dimensions :]
         return -0.5 * jnp.mean(jnp.log(spread + jnp.finfo(tips.dtype).eps))

@@ -107,7 +107,10 @@ def formulate(
         if model is None
         else instance("model", model, Model, "StrainDependent(), Prescribed(basis) or Continuum()")
     )
-    terms = Terms(scene, sets, solver, minimised, (*inside, *checked), _factors(uncertain, known))
+    factors = _factors(uncertain, known)
+    vague = ((name, i) for name in factors for i in range(known[name].size))
+    check_free(scene, scene.driven, vague)
+    terms = Terms(scene, sets, solver, minimised, (*inside, *checked), factors)
     low, high, terms, given = cast(
         (low, high, terms, {name: known[name] for name in low}), sets.dtype
     )

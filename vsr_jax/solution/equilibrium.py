@@ -68,8 +68,11 @@ class Equilibrium(Solved):
     def __init__(
         self, scene: Scene, inputs: Float[Array, " inputs"], model: Model, outcome: Outcome
     ):
-        self.scene, self.inputs, self.model = scene.at(inputs), inputs, model
-        self._given = scene if scene.driven else None
+        self.inputs, self.model = inputs, model
+        self.scene, self._given = scene, None
+        if scene.driven:  # at inputs that are refused, the scene as it is: nothing becomes NaN
+            sound = jnp.where(scene.admits(inputs), inputs, scene.rest_inputs)
+            self.scene, self._given = scene.at(sound), scene
         self.state, self._forces, self.status, self.steps = outcome[:4]
         self._loosened, self._restarted = outcome.loosened, outcome.restarted
 

@@ -86,7 +86,7 @@ def view(
         scene.refuse_batch()
         inputs = scene.inputs if inputs is None else inputs
         model = scene.model if model is None else model
-        scene = scene.scene
+        scene = scene.given_scene
     instance("scene", scene, Scene, "a Scene or an Equilibrium")
     session = Session(scene, inputs, numbers=numbers, bounds=bounds, model=model, title=title)
     tracks = tracks_of(session, play)

@@ -170,7 +170,7 @@ class Session:
         near = Reach(start.inputs, start, zero, jnp.array(True), zero, zero)
         with self.first("the drag of the tip"):
             found = reach(
-                start.scene,
+                start.given_scene,
                 self.typed(target),
                 (low, high),
                 model=self.model,

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..arm.actuator import Actuator, Chamber
+from ..arm.driven import check_free
 from ..arm.plausible import quietly
 from ..arm.scene import Scene
 from ..arm.scene_numbers import Parameter, matching, parameters
@@ -120,9 +121,17 @@ def number_sliders(scene: Scene, chosen: Chosen) -> list[Slider]:
             each = (
                 [name] if name in entries else [e for e, (of, _) in entries.items() if of == name]
             )
+            check_free(
+                scene, scene.driven, [(entries[x][0], _flat(known, *entries[x])) for x in each]
+            )
             for entry in each:
                 found[entry] = _number_slider(scene, known, entry, *entries[entry], ends)
     return list(found.values())
+
+
+def _flat(known: Mapping[str, Parameter], of: str, place: tuple[int, ...]) -> int:
+    """Index of an entry in its flat array."""
+    return int(np.ravel_multi_index(place, known[of].value.shape)) if place else 0
 
 
 def _ranges(chosen: Chosen) -> dict[str, Range]:
