@@ -313,7 +313,7 @@ def test_the_default_bounds_of_negative_forces_end_at_zero(capsys):
     assert "inputs      -5 to 0\nsamples     3 converged\n" in capsys.readouterr().out
     vsr = vsr_jax
     threads = [vsr.Thread(vsr.Parallel(y, 0.0)) for y in (-0.001, 0.0, 0.001)]
-    rod = vsr.Rod(0.2, vsr.Circular(0.004), vsr.Material(1e6))
+    rod = vsr.Rod(0.2, vsr.Circular(0.004), vsr.Material(1e6, poisson=0.4))
     scene = vsr.Scene(rod, threads)
     low, high = cli_common.bounds(None, None, scene, np.array([-2.0, 0.0, 3.0]))
     assert (low.tolist(), high.tolist()) == ([-2.0, 0.0, 0.0], [0.0, 0.0, 3.0])
