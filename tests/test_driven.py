@@ -307,6 +307,21 @@ def test_a_path_of_a_gripper_is_followed():
     assert np.all(np.asarray(on.converged))
 
 
+@pytest.mark.slow
+def test_a_gripper_turns_by_more_than_half_a_turn():
+    """The torque of a straight rod, G J / L times the angle, up to 8 rad; pulled, so that it stays
+    straight."""
+    held = vsr.Held(position=(1.01 * L, 0.0, 0.0), orientation=np.eye(3))
+    turn = vsr.Input("held[0].orientation.turn_x")
+    angles = np.linspace(0, 8, 17)
+    scene = vsr.Scene(rod(), held=held, driven=turn)
+    path = vsr.follow(scene, angles[:, None], model=vsr.StrainDependent(4))
+    assert np.all(np.asarray(path.converged))
+    torques = jax.vmap(lambda eq: eq.supports[0, 0])(path)
+    stiffness = 1e6 / (2 * 1.45) * np.pi * 0.004**4 / 2
+    np.testing.assert_allclose(torques, stiffness * angles / L, rtol=1e-6, atol=1e-12)
+
+
 def test_fits_and_designs_refuse_driven_numbers():
     markers = vsr.Markers(np.zeros((2, 3)), sd=1e-3)
     data = vsr.Measurements([[0.0, 0.1, 0.0], [0.0, 0.2, 0.0]], markers)
