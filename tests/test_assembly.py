@@ -52,8 +52,9 @@ def test_a_plate_on_an_arm_is_a_payload():
     np.testing.assert_allclose(eq.arms[0].tip, eq.poses[0], atol=1e-7)
     weight = 0.001 * 9.81
     np.testing.assert_allclose(eq.arms[0].supports[0, 3:], [0, 0, -weight], atol=1e-9 * weight)
-    # stiffness of a tip against wrenches: the inverse of its compliance, in the body's axes
-    turn = np.kron(np.eye(2), np.asarray(same.tip[:3, :3]))
+    # stiffness of a tip against wrenches: the inverse of its compliance, turns in its own axes
+    turn = np.eye(6)
+    turn[:3, :3] = same.tip[:3, :3]
     compliance = turn.T @ np.asarray(vsr.compliance(same)) @ turn
     np.testing.assert_allclose(np.linalg.inv(eq.stiffness), compliance, rtol=1e-4, atol=1e-3)
 

@@ -43,9 +43,10 @@ class Body(Part):
         self.moment = numbers("Body.moment", moment, (3,))
 
     def wrench(self, pose: Pose, gravity: Array) -> Float[Array, "6"]:
-        """Moment [N m] about its origin and force [N] on it in a pose, both in its own axes."""
+        """Moment [N m] about its origin in its own axes, and force [N] in the world's, on it in a
+        pose."""
         force, moment = self.force, self.moment
         if self.mass is not None:
             weight = self.mass * gravity
             force, moment = force + weight, moment + jnp.cross(pose[:3, :3] @ self.centre, weight)
-        return jnp.concatenate([pose[:3, :3].T @ moment, pose[:3, :3].T @ force])
+        return jnp.concatenate([pose[:3, :3].T @ moment, force])

@@ -19,8 +19,8 @@ class AssemblyEquilibrium(eqx.Module):
     - `poses` of the bodies, shape (bodies, 4, 4); NaN where the solve failed.
     - `arms`: the `Equilibrium` of each arm between its joints, with all its quantities: in
       `eq.arms[0].supports` are the wrenches of its own held sections and of its joints.
-    - `stiffness`: K of the bodies, shape (6 bodies, 6 bodies), by turns [rad] about and motions [m]
-      along the axes of each: [N m] and [N].
+    - `stiffness`: K of the bodies, shape (6 bodies, 6 bodies), by turns [rad] about the axes of
+      each and motions [m] along those of the world: [N m] and [N].
     - `stability`: the least eigenvalue of K, with turns in radians, motions as a share of the mean
       length of the arms, in units of the arms' mean bending stiffness over that length: positive
       where the whole is stable. Without bodies the least margin of the arms.

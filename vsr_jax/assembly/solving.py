@@ -1,9 +1,10 @@
 r"""Equilibrium of an assembly by condensing its arms.
 
-The unknowns are the poses of the bodies. The residual is the wrench f (moment about the origin,
-force) on each, in its own axes; its derivative by motions of the bodies in their own axes comes
-from the implicit derivatives of the arms, which are solved between their joints from their last
-shapes. Arms of one structure are solved side by side by one program.
+The unknowns are the poses of the bodies. The residual f is the moment about the origin of each, in
+its own axes, and the force in those of the world: a turn about the origin leaves the force as it
+is. Its derivative by turns about their own axes and motions along the world's comes from the
+implicit derivatives of the arms, which are solved between their joints from their last shapes. Arms
+of one structure are solved side by side by one program.
 
 The inputs go from those of the start, or from rest, to the given ones, at once if they can; without
 a start the joints go with them, from where the sections lie at rest. A step
@@ -255,7 +256,8 @@ class _Whole(NamedTuple):
         return [arms[i] for i in range(len(scenes))]
 
     def wrench(self, poses: Array, arms: list[Equilibrium]) -> Float[Array, "bodies 6"]:
-        """Moment [N m] about its origin and force [N] on each body, in its own axes."""
+        """Moment [N m] about the origin of each body in its own axes, and force [N] in the
+        world's."""
         assembly = self.assembly
         total = [body.wrench(poses[b], assembly.gravity) for b, body in enumerate(assembly.bodies)]
         for i, eq in enumerate(arms):
@@ -263,7 +265,9 @@ class _Whole(NamedTuple):
             rows = [pair for pair in assembly.jointed(i) if not pair[1].at_base]
             for k, (_, joint) in enumerate(rows):
                 if joint.body is not None:
-                    there = eq.tip if joint.X is None else eq.pose(joint.X)
+                    there = joint.in_world(poses)  # where its section is, unless it slides
+                    if joint.kind == "slider":
+                        there = eq.tip if joint.X is None else eq.pose(joint.X)
                     pull = -eq.supports[own + k]
                     total[joint.body] += _on_body(poses[joint.body], pull, there[:3, 3])
             for _, joint in assembly.jointed(i):
@@ -278,19 +282,19 @@ class _Whole(NamedTuple):
 
 
 def _on_body(pose: Array, pull: Array, at: Array) -> Float[Array, "6"]:
-    """A wrench (moment, force) of the world at a point, about the origin and in the axes of a
-    body."""
+    """A wrench (moment, force) of the world at a point as one on a body: moment about its origin in
+    its axes, force in the world's."""
     moment = pull[:3] + jnp.cross(at - pose[:3, 3], pull[3:])
-    return jnp.concatenate([pose[:3, :3].T @ moment, pose[:3, :3].T @ pull[3:]])
+    return jnp.concatenate([pose[:3, :3].T @ moment, pull[3:]])
 
 
 def moved(poses: Float[Array, "bodies 4 4"], motion: Array) -> Float[Array, "bodies 4 4"]:
-    """Bodies after motions along and about their own axes, six numbers each."""
+    """Bodies after turns about their own axes and motions along the world's, six numbers each."""
     by = motion.reshape(-1, 6)
 
     def one(pose: Array, by: Array) -> Array:
         turn = exp(jnp.concatenate([by[:3], jnp.zeros_like(by[:3])]))
-        return pose @ turn.at[:3, 3].set(by[3:])
+        return (pose @ turn).at[:3, 3].add(by[3:])
 
     return jax.vmap(one)(poses, by)
 

@@ -43,6 +43,8 @@ def _clamped(x: Array) -> Array:
 
 def _gathered(x: Array) -> Array:
     """The values, gathered row by row along all axes but the last."""
+    if not x.size:
+        return x
     rows = x.reshape(-1, *x.shape[-1:])
     return rows.at[jnp.arange(rows.shape[0])].get(mode="promise_in_bounds").reshape(x.shape)
 
