@@ -19,6 +19,7 @@ import numpy as np
 from matplotlib.patches import Circle
 
 import vsr_jax as vsr
+from benchmarks import six_rods
 from benchmarks.designs import arm as wire, s_curve
 from vsr_jax import annotate, plot, plot_design
 from vsr_jax.arm.placement import Direction
@@ -180,25 +181,9 @@ _ARROW |= {"units": "xy", "width": 1.4}
 
 def hexapod() -> Any:
     """The six rods and the plate of the guide."""
-    up = np.asarray(vsr.pose(pointing="up"))
-
-    def at(radius: float, angle: float) -> np.ndarray:
-        pose = up.copy()
-        pose[:3, 3] = radius * np.cos(angle), radius * np.sin(angle), 0.0
-        return pose
-
-    legs, joints = [], []
-    for k in range(6):
-        angle, turn = np.pi / 3 * k, 0.25 if k % 2 else -0.25
-        nylon = vsr.Material(2e9, poisson=0.4, density=1150.0)
-        rod = vsr.Rod(0.3, vsr.Circular(0.002), nylon, base=at(0.06, angle))
-        legs.append(vsr.Scene(rod, driven=vsr.Input("rod.length")))
-        joints.append(vsr.Joint(k, 0, pose=at(0.05, angle + turn)))
-    plate = np.eye(4)
-    plate[2, 3] = 0.299
-    whole = vsr.Assembly(legs, vsr.Body(plate, mass=0.4), joints)
-    lengths = [0.31, 0.295, 0.315, 0.3, 0.31, 0.29]
-    return plot.assembly(vsr.solve_assembly(whole, lengths, model=MODEL)).figure
+    return plot.assembly(
+        vsr.solve_assembly(six_rods.hexapod(), six_rods.LENGTHS, model=MODEL)
+    ).figure
 
 
 class _Held(NamedTuple):

@@ -311,16 +311,15 @@ def test_the_default_bounds_of_negative_forces_end_at_zero(capsys):
     arguments = ["sweep", HELIX, "--samples", "3", "--steps", "8"]
     assert cli.main(arguments) == cli_common.DONE
     assert "inputs      -5 to 0\nsamples     3 converged\n" in capsys.readouterr().out
-    vsr = vsr_jax
-    threads = [vsr.Thread(vsr.Parallel(y, 0.0)) for y in (-0.001, 0.0, 0.001)]
-    rod = vsr.Rod(0.2, vsr.Circular(0.004), vsr.Material(1e6, poisson=0.4))
-    scene = vsr.Scene(rod, threads)
+    threads = [vsr_jax.Thread(vsr_jax.Parallel(y, 0.0)) for y in (-0.001, 0.0, 0.001)]
+    rod = vsr_jax.Rod(0.2, vsr_jax.Circular(0.004), vsr_jax.Material(1e6, poisson=0.4))
+    scene = vsr_jax.Scene(rod, threads)
     low, high = cli_common.bounds(None, None, scene, np.array([-2.0, 0.0, 3.0]))
     assert (low.tolist(), high.tolist()) == ([-2.0, 0.0, 0.0], [0.0, 0.0, 3.0])
-    scene = vsr.Scene(rod, threads[:1], driven=vsr.Input("rod.length", low=0.1))
+    scene = vsr_jax.Scene(rod, threads[:1], driven=vsr_jax.Input("rod.length", low=0.1))
     low, high = cli_common.bounds([-1.0], None, scene, np.array([-2.0, 0.3]))
     assert (low.tolist(), high.tolist()) == ([-1.0, -1.0], [0.0, 0.3])
-    scene = vsr.Scene(rod, driven=vsr.Input("rod.length", low=0.1, high=0.3))
+    scene = vsr_jax.Scene(rod, driven=vsr_jax.Input("rod.length", low=0.1, high=0.3))
     low, high = cli_common.bounds(None, None, scene, np.array([0.25]))
     assert (low.tolist(), high.tolist()) == ([0.1], [0.3])
 

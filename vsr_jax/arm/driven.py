@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..numerics.se3 import exp
+from ..numerics.se3 import stacked_rotation
 from ..typing import Scalar
 from .description import Part
 from .scene_numbers import Module, Parameter, matching, parameters, replaced
@@ -225,6 +225,8 @@ def _changed(parameter: Parameter, rows: Mapping[int, Array]) -> Array:
         return old.reshape(-1).at[np.array(list(rows))].set(new).reshape(old.shape)
     none = jnp.zeros((), old.dtype)
     by = [rows[i].astype(old.dtype) if i in rows else none for i in range(6)]
-    turn = exp(jnp.stack([*by[:3], none, none, none]))
-    size = old.shape[-1]
-    return old @ turn.at[:3, 3].set(jnp.stack(by[3:]))[:size, :size]
+    turn = stacked_rotation(jnp.stack(by[:3]))
+    if old.shape[-1] == 3:
+        return old @ turn
+    motion = jnp.eye(4, dtype=old.dtype).at[:3, :3].set(turn).at[:3, 3].set(jnp.stack(by[3:]))
+    return old @ motion

@@ -145,12 +145,15 @@ class Held(Support):
 
     def _directions(self, axes: Array) -> Float[Array, "3 forces"]:
         """Unit vectors of the world in which its position is held, along `axes` where it can be."""
-        if self.along is None:
-            return axes
-        a = self.along / jnp.sqrt(jnp.sum(self.along**2))
-        first = jnp.cross(a, axes[:, jnp.argmin(jnp.abs(axes.T @ a))])
-        first = first / jnp.sqrt(jnp.sum(first**2))
-        return jnp.stack([first, jnp.cross(a, first)], axis=1)
+        return axes if self.along is None else directions_across(self.along, axes)
+
+
+def directions_across(line: Float[Array, "3"], axes: Array) -> Float[Array, "3 2"]:
+    """Two unit vectors across a line and each other, the first one across one of the `axes` too."""
+    a = line / jnp.sqrt(jnp.sum(line**2))
+    first = jnp.cross(a, axes[:, jnp.argmin(jnp.abs(axes.T @ a))])
+    first = first / jnp.sqrt(jnp.sum(first**2))
+    return jnp.stack([first, jnp.cross(a, first)], axis=1)
 
 
 def _rotation(value: MatrixLike) -> Float[Array, "3 3"]:

@@ -108,18 +108,11 @@ class Assembly(Part):
         for i, (arm, own) in enumerate(zip(self.arms, self.split(values), strict=True)):
             try:
                 arm.check_inputs(own)
-                self._check_places(i, own)
+                for j, joint in self.jointed(i):
+                    _check_place(f"joints[{j}]", joint, arm.at(own))
             except ValueError as error:
                 raise ValueError(f"arms[{i}]: {error}") from None
         return values
-
-    def _check_places(self, arm: int, inputs: Array) -> None:
-        """Raises `ValueError` for joints beyond an arm whose length is an input."""
-        length = _known(self.arms[arm].at(inputs).rod.length)
-        for i, joint in self.jointed(arm):
-            X = _known(joint.X)
-            if X is not None and length is not None and length < X:
-                raise ValueError(f"joints[{i}].X: got {X:g} m on an arm of {length:g} m")
 
     def jointed(self, arm: int) -> list[tuple[int, Joint]]:
         """The joints of an arm with their places in `joints`, that of its base first."""
@@ -198,7 +191,11 @@ def _check_joint(path: str, joint: Joint, arms: Sequence[Scene], bodies: int) ->
         raise ValueError(f"{path}.body: got {joint.body}, need the index of one of {bodies} bodies")
     if joint.at_base and joint.body is None:
         raise ValueError(f"{path}: got a base on the ground, need Rod(base=...) for its pose")
-    X, length = (_known(x) for x in (joint.X, arms[joint.arm].rod.length))
+    _check_place(path, joint, arms[joint.arm])
+
+
+def _check_place(path: str, joint: Joint, arm: Scene) -> None:
+    X, length = _known(joint.X), _known(arm.rod.length)
     if X is not None and length is not None and length < X:
         raise ValueError(f"{path}.X: got {X:g} m, need at most {length:g} m, the length of the arm")
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..arm.description import Part
-from ..arm.held import Support
+from ..arm.held import Support, directions_across
 from ..arm.pose_loads import Needs
 from ..numerics.se3 import rotation_vector
 from ..typing import MatrixLike, Pose, Scalar, ScalarLike, VectorLike, real
@@ -132,10 +132,8 @@ class JointSupport(Support):
         if self.kind == "fixed":
             return jnp.concatenate([apart, rotation_vector(turn)])
         assert self.axis is not None
-        a = self.axis / jnp.sqrt(jnp.sum(self.axis**2))
-        first = jnp.cross(a, jnp.eye(3, dtype=a.dtype)[jnp.argmin(jnp.abs(a))])
-        first = first / jnp.sqrt(jnp.sum(first**2))
-        across = jnp.stack([first, jnp.cross(a, first)])
+        across = directions_across(self.axis, jnp.eye(3, dtype=self.axis.dtype)).T
         if self.kind == "hinge":
+            a = self.axis / jnp.sqrt(jnp.sum(self.axis**2))
             return jnp.concatenate([apart, across @ (turn @ a)])
         return jnp.concatenate([across @ apart, rotation_vector(turn)])

@@ -7,12 +7,11 @@ implicit derivatives of the arms, which are solved between their joints from the
 of one structure are solved side by side by one program.
 
 The inputs go from those of the start, or from rest, to the given ones, at once if they can; without
-a start the joints go with them, from where the sections lie at rest. A step
-is $K^{-1} (f + \Delta f)$ with the change of the wrench by the inputs, or downhill along the
-eigenvectors of K where it is not positive definite, at most as long as a radius. It is taken if all
-arms are solved there and the wrench along the step has not turned against it by more than
-`_OVERSHOOT` of what it was; else it is halved. Without a potential this is still a descent along
-the forces.
+a start the joints go with them, from where the sections lie at rest. A step is $K^{-1} (f + \Delta
+f)$ with the change of the wrench by the inputs, or downhill along the eigenvectors of K where it is
+not positive definite, at most as long as a radius. It is taken if all arms are solved there and the
+wrench along the step has not turned against it by more than `_OVERSHOOT` of what it was; else it is
+halved. Without a potential this is still a descent along the forces.
 """
 
 from collections.abc import Callable
@@ -30,12 +29,13 @@ from ..models.base import Model, Near, Outcome, Status
 from ..models.strain_dependent import StrainDependent
 from ..numerics.compiling import program
 from ..numerics.loops import while_loop
-from ..numerics.se3 import exp
+from ..numerics.se3 import stacked_rotation
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import outcome_of, status_of_inputs
 from ..typing import DTypeLike, VectorLike, cast
 from ..validation import instance
 from .assembly import Assembly
+from .joint import Joint
 from .solved import AssemblyEquilibrium
 
 _OVERSHOOT = 0.9
@@ -45,16 +45,6 @@ _RADIUS = 0.3
 _MOST_STEPS = 60
 _LEAST = 1e-6
 """Share of the longest step, and of the way of the inputs, below which the search is given up."""
-
-
-class _Group(NamedTuple):
-    """Arms of one structure: their places in the assembly."""
-
-    places: tuple[int, ...]
-
-    def stacked(self, items: list) -> Any:
-        """Items of these arms with a leading axis."""
-        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *(items[i] for i in self.places))
 
 
 class _Search(NamedTuple):
@@ -163,6 +153,11 @@ def _with_status(eq: Equilibrium, fine: Array, status: Array) -> Equilibrium:
     return eqx.tree_at(lambda arm: arm.status, eq, jnp.where(fine, eq.status, status))
 
 
+def _stacked(places: tuple[int, ...], items: list) -> Any:
+    """Items of the arms at some places, with a leading axis."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *(items[i] for i in places))
+
+
 class _Whole(NamedTuple):
     """The assembly as functions of the poses of its bodies."""
 
@@ -175,14 +170,14 @@ class _Whole(NamedTuple):
         return self.assembly.split(self.inputs)
 
     @property
-    def groups(self) -> list[_Group]:
-        """The arms by their structure."""
+    def groups(self) -> list[tuple[int, ...]]:
+        """Places of the arms of one structure each."""
         found: dict[Any, list[int]] = {}
         scenes = self.assembly.placed(self.assembly.poses)
         for i, pair in enumerate(zip(scenes, self.own_inputs, strict=True)):
             shapes = tuple(jnp.shape(x) for x in jax.tree.leaves(pair))
             found.setdefault((jax.tree.structure(pair), shapes), []).append(i)
-        return [_Group(tuple(places)) for places in found.values()]
+        return [tuple(places) for places in found.values()]
 
     @property
     def length(self) -> Array:
@@ -216,8 +211,8 @@ class _Whole(NamedTuple):
 
         every = scenes, inputs, last_scenes, last_inputs
         found = []
-        for group, outcome in zip(self.groups, near, strict=True):
-            given: Any = [*(group.stacked(x) for x in every), outcome]
+        for places, outcome in zip(self.groups, near, strict=True):
+            given: Any = [*(_stacked(places, x) for x in every), outcome]
             found.append(jax.vmap(one)(*given))
         return tuple(found)
 
@@ -229,8 +224,8 @@ class _Whole(NamedTuple):
         def one(scene: Scene, u: Array) -> Outcome:
             return outcome_of(scene, u, self.model)._replace(nodes=None, restarted=None)
 
-        for group in self.groups:
-            given = group.stacked(scenes), group.stacked(self.own_inputs)
+        for places in self.groups:
+            given = _stacked(places, scenes), _stacked(places, self.own_inputs)
             kind = eqx.filter_eval_shape(jax.vmap(one), *given)
             outcome = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), kind)
             found.append(outcome._replace(state=self.model.straight(outcome.state)))
@@ -248,10 +243,10 @@ class _Whole(NamedTuple):
             status = jnp.where(_balanced(outcome.status), Status.CONVERGED, outcome.status)
             return Equilibrium(scene, u, self.model, there._replace(status=status))
 
-        for group, outcome in zip(self.groups, found.outcomes, strict=True):
-            given: Any = [*(group.stacked(items) for items in (scenes, inputs, before)), outcome]
+        for places, outcome in zip(self.groups, found.outcomes, strict=True):
+            given: Any = [*(_stacked(places, x) for x in (scenes, inputs, before)), outcome]
             eqs = jax.vmap(one)(*given)
-            for k, i in enumerate(group.places):
+            for k, i in enumerate(places):
                 arms[i] = jax.tree.map(lambda x, k=k: x[k], eqs)
         return [arms[i] for i in range(len(scenes))]
 
@@ -260,28 +255,35 @@ class _Whole(NamedTuple):
         world's."""
         assembly = self.assembly
         total = [body.wrench(poses[b], assembly.gravity) for b, body in enumerate(assembly.bodies)]
-        for i, eq in enumerate(arms):
-            own = len(assembly.arms[i].held)
-            rows = [pair for pair in assembly.jointed(i) if not pair[1].at_base]
-            for k, (_, joint) in enumerate(rows):
-                if joint.body is not None:
-                    there = joint.in_world(poses)  # where its section is, unless it slides
-                    if joint.kind == "slider":
-                        there = eq.tip if joint.X is None else eq.pose(joint.X)
-                    pull = -eq.supports[own + k]
-                    total[joint.body] += _on_body(poses[joint.body], pull, there[:3, 3])
+        for i, (arm, eq) in enumerate(zip(assembly.arms, arms, strict=True)):
+            held = iter(eq.supports[len(arm.held) :])  # by each joint but that of the base
             for _, joint in assembly.jointed(i):
-                if joint.at_base and joint.body is not None:
-                    # its own base may be driven: where it is, not where the joint is
-                    section, inner = eq.scene.rod.frame, eq.reaction(jnp.zeros(()))
-                    assert section is not None
-                    R = section[:3, :3]
-                    pull = jnp.concatenate([R @ inner[:3], R @ inner[3:]])
-                    total[joint.body] += _on_body(poses[joint.body], pull, section[:3, 3])
+                if joint.at_base:
+                    pull, place = _pull_on_base(eq)
+                else:
+                    pull, place = -next(held), _place(joint, poses, eq)
+                if joint.body is not None:
+                    total[joint.body] += _wrench_on(poses[joint.body], pull, place)
         return jnp.stack(total)
 
 
-def _on_body(pose: Array, pull: Array, at: Array) -> Float[Array, "6"]:
+def _pull_on_base(eq: Equilibrium) -> tuple[Array, Array]:
+    """Moment and force in the world by which an arm pulls its base, and where: its base may be
+    driven beyond the joint."""
+    base, inner = eq.scene.rod.frame, eq.reaction(jnp.zeros(()))
+    assert base is not None  # a joint has placed it
+    R = base[:3, :3]
+    return jnp.concatenate([R @ inner[:3], R @ inner[3:]]), base[:3, 3]
+
+
+def _place(joint: Joint, poses: Array, eq: Equilibrium) -> Array:
+    """Where the section of a joint is [m]: in the joint, unless it slides."""
+    if joint.kind != "slider":
+        return joint.in_world(poses)[:3, 3]
+    return eq.tip[:3, 3] if joint.X is None else eq.position(joint.X)
+
+
+def _wrench_on(pose: Array, pull: Array, at: Array) -> Float[Array, "6"]:
     """A wrench (moment, force) of the world at a point as one on a body: moment about its origin in
     its axes, force in the world's."""
     moment = pull[:3] + jnp.cross(at - pose[:3, 3], pull[3:])
@@ -293,8 +295,8 @@ def moved(poses: Float[Array, "bodies 4 4"], motion: Array) -> Float[Array, "bod
     by = motion.reshape(-1, 6)
 
     def one(pose: Array, by: Array) -> Array:
-        turn = exp(jnp.concatenate([by[:3], jnp.zeros_like(by[:3])]))
-        return (pose @ turn).at[:3, 3].add(by[3:])
+        turned = pose.at[:3, :3].set(pose[:3, :3] @ stacked_rotation(by[:3]))
+        return turned.at[:3, 3].add(by[3:])
 
     return jax.vmap(one)(poses, by)
 

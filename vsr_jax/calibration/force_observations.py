@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from ..arm.held import Held
 from ..arm.scene import Scene
-from ..numerics.se3 import exp
+from ..numerics.se3 import stacked_rotation
 from ..solution.equilibrium import Equilibrium
 from ..typing import ArrayLike, ScalarLike
 from ..validation import numbers
@@ -134,9 +134,9 @@ class Reactions(Observation):
         self.name = name
 
     def predicted(self, eq: Equilibrium) -> Float[Array, "rows 3"]:
-        wrenches, found = eq.supports[jnp.array(self.held)], []
+        wrenches = eq.supports[jnp.array(self.held)]
         axes = jnp.stack([self._axes(eq, i) for i in self.held])
-        sensor = axes @ jax.vmap(_turned)(self.turn)
+        sensor = axes @ jax.vmap(stacked_rotation)(self.turn)
         found = [_in_axes(sensor, wrenches[:, 3:]) + self.offset]
         if self.moment_offset is not None and self.place is not None:
             lever = jnp.einsum("nij,nj->ni", axes, self.place)
@@ -216,7 +216,7 @@ class ContactForces(Observation):
         found = eq.contacts
         each = found.force[..., None] * found.normal + found.friction
         total = jnp.sum(each, axis=1)[jnp.array(self.obstacles)]
-        return _in_axes(jax.vmap(_turned)(self.turn), total) + self.offset
+        return _in_axes(jax.vmap(stacked_rotation)(self.turn), total) + self.offset
 
     def check(self, scene: Scene) -> None:
         _check_indices(f"{self.name}.obstacles", self.obstacles, len(scene.obstacles), "obstacle")
@@ -239,10 +239,6 @@ def _check_indices(name: str, indices: Sequence[int], count: int, what: str) -> 
     for i in indices:
         if not 0 <= i < count:
             raise ValueError(f"{name}: got {i}, need the index of one of {count} {what}s, from 0")
-
-
-def _turned(vector: Array) -> Float[Array, "3 3"]:
-    return exp(jnp.concatenate([vector, jnp.zeros_like(vector)]))[:3, :3]
 
 
 def _in_axes(axes: Float[Array, "n 3 3"], vectors: Float[Array, "n 3"]) -> Float[Array, "n 3"]:

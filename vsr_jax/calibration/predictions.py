@@ -14,8 +14,8 @@ from jaxtyping import Array, Float
 from ..arm.scene import Scene
 from ..arm.scene_numbers import parameters, replaced
 from ..models.base import Model, Near, Outcome
-from ..numerics import se3
 from ..numerics.compiling import program
+from ..numerics.se3 import stacked_rotation
 from ..solution.equilibrium import Equilibrium
 from ..solution.solver import outcome_of
 from .observation import Observation
@@ -126,8 +126,7 @@ def _moved(scene: Scene, position: Array | None, rotation: Array | None) -> Scen
     dtype = scene.rod.length.dtype
     base = jnp.eye(4, dtype=dtype) if scene.rod.base is None else scene.rod.base
     if rotation is not None:
-        turn = se3.exp(jnp.concatenate([rotation, jnp.zeros(3, dtype)]))[:3, :3]
-        base = base.at[:3, :3].set(turn @ base[:3, :3])
+        base = base.at[:3, :3].set(stacked_rotation(rotation) @ base[:3, :3])
     if position is not None:
         base = base.at[:3, 3].add(position)
     return eqx.tree_at(lambda s: s.rod.base, scene, base, is_leaf=lambda x: x is None)
